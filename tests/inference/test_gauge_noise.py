@@ -248,6 +248,7 @@ def test_steady_pressures_stay_nearly_constant(per_reading):
     quiet = gauge.denoised_traces(tracks)
     off = [trace.pressure_Pa - 8e3 for trace in quiet]
     assert all(np.std(each) < 0.5 * trace.mean_error_Pa for each, trace in zip(off, quiet, strict=True))
+    assert per_reading > 1 or np.mean([trace.errors_Pa.shape[1] for trace in quiet]) < 1
     z = [each.mean() / trace.mean_error_Pa for each, trace in zip(off, quiet, strict=True)]
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
@@ -264,6 +265,18 @@ def test_a_pressure_is_extrapolated_linearly_but_not_below_ambient():
     assert longer.mean_error_Pa == 5.0
     let_out = gauge.DenoisedTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
     assert let_out.pressure_Pa[-1] == 0.0
+
+
+def test_a_trace_keeps_the_samples_whose_lines_give_all_others():
+    pressure_Pa, _, _ = emptied(0)
+    errors_Pa = np.column_stack([np.full(TIMES_S.size, 20.0), 30.0 * np.sin(20 * TIMES_S)])
+    few = gauge.DenoisedTrace(TIMES_S, pressure_Pa, 5.0, errors_Pa).thinned()
+    assert few.time_s.size < 120
+    for all_Pa, of_few_Pa in zip([pressure_Pa, *errors_Pa.T], [few.pressure_Pa, *few.errors_Pa.T], strict=True):
+        assert np.max(np.abs(np.interp(TIMES_S, few.time_s, of_few_Pa) - all_Pa)) < 1.1e-5 * np.median(pressure_Pa)
+    assert np.isin(few.pressure_Pa, pressure_Pa).all()
+    still = gauge.DenoisedTrace(TIMES_S, np.full(TIMES_S.size, 8e3), 5.0, np.zeros((TIMES_S.size, 0))).thinned()
+    assert still.time_s.tolist() == [TIMES_S[0], TIMES_S[-1]]
 
 
 @pytest.fixture(scope="module")

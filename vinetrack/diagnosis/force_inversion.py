@@ -33,7 +33,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import splines, whiten
 from vinetrack.inference.marginal_likelihood import eliminated, inverse_of_block, trial_effect_prior
 from vinetrack.inference.optimiser import track_correlation, variance_floor
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
 
 # ------------------------------------------------------------------------------
 # Compiled integration of the variational equations: responses of motions to small accelerations.
@@ -147,19 +147,20 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
         None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
         for trial_data, job in zip(predictor.data, jobs, strict=True)
     ]
-    runs = simulate_many(
-        fit.model, trials, grids, traces=traces, parameters=np.array([job.row for job in jobs]), host=predictor.host
-    )
+    runs = simulate_many(fit.model, trials, grids, traces=traces, parameters=jobs.row, host=predictor.host)
     return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
 
 
-def _trial_of_job(trial: Trial, job: Job) -> Trial:
+def _trial_of_job(trial: Trial, job: Jobs) -> Trial:
     """The trial with the pressure and yield pressure that its job simulates."""
-    yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
-    return replace(trial, pressure_Pa=trial.pressure_Pa * (1 + job.pressure_deviation), yield_pressure_Pa=yield_Pa)
+    yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
+    pressure_Pa = trial.pressure_Pa * (1 + float(job.pressure_deviation))
+    return replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
 
 
-def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[Floats, Floats] | None) -> FittedMotion:
+def _motion(
+    model: Model, trial: Trial, job: Jobs, run: Trajectory, trace: tuple[Floats, Floats] | None
+) -> FittedMotion:
     model = model.with_values(dict(zip(model.parameter_names, job.row.tolist(), strict=True)))
     measured = None if trace is None else np.interp(run.time_s, *trace)
     if measured is None and any("chamber_rate" in effect.functions for effect in model):
@@ -421,10 +422,10 @@ class ForceProblem:
             derivatives.append(np.column_stack(columns))
         return ForcePoint(theta, trial_effects, moved, derivatives)
 
-    def _with_job(self, motion: FittedMotion, job: Job) -> FittedMotion:
+    def _with_job(self, motion: FittedMotion, job: Jobs) -> FittedMotion:
         """The same motion, its model and trial with the parameters of a job."""
         values = dict(zip(motion.model.parameter_names, job.row.tolist(), strict=True))
-        trial = _trial_of_job(self.data[job.trial].trial, job)
+        trial = _trial_of_job(self.data[int(job.trial)].trial, job)
         return replace(motion, model=motion.model.with_values(values), trial=trial)
 
 

@@ -121,10 +121,9 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
 def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
     state, before = start.state, start.predictor.data
-    jobs = start.predictor.job_arrays(state.theta, state.trial_effects)
-    moved = start.predictor.run_as(
-        start.model + shape.effect, jobs.with_effect([shape.size.zero + size, *shape.other_values])
-    )
+    jobs = start.predictor.jobs(state.theta, state.trial_effects)
+    jobs = jobs.with_effect([shape.size.zero + size, *shape.other_values])
+    moved = start.predictor.run(jobs, model=start.model + shape.effect)
     used = [_used_points(trial_data, trajectory) for trial_data, trajectory in zip(before, moved, strict=True)]
     origins_m = state.trial_effects[:, ORIGIN]
     data = [

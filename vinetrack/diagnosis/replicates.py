@@ -76,7 +76,7 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
         return []
-    stated_Pa = [_stated_Pa(trial_data) for trial_data in data]
+    stated_Pa = [trial_data.typical_pressure_Pa for trial_data in data]
     force_N = np.array([_force_N(*pair) for pair in zip(trials, stated_Pa, strict=True)])
     driven = force_N > 0
     of_vine = np.array([trial.vine for trial in trials])
@@ -118,11 +118,6 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     expected_N = np.where(np.isin(of_vine, vines), np.exp(curves @ fitted.x), math.nan)
     implied_Pa = [stated_Pa[k] + (expected_N[k] - force_N[k]) / trials[k].area_m2 for k in odd]
     return [OddTrial(trials[k].name, stated_Pa[k], float(Pa)) for k, Pa in zip(odd, implied_Pa, strict=True)]
-
-
-def _stated_Pa(trial_data: FitTrial) -> float:
-    """Pressure of the row, or the median of the recorded pressure."""
-    return trial_data.trial.pressure_Pa if trial_data.trace is None else float(np.median(trial_data.trace[1]))
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:

@@ -317,10 +317,10 @@ def _response(fit: Fit, change: Sequence[Floats]) -> float:
 def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> list[Floats]:
     """Change of the positions of every trial with the step of the shape added, m."""
     predictor, state = fit.predictor, fit.solution.state
-    jobs = predictor.job_arrays(state.theta, state.trial_effects).with_effect(shape.values)
+    jobs = predictor.jobs(state.theta, state.trial_effects).with_effect(shape.values)
     shared = shape.size.shared if shape.group else ""
     affected = [i for i, trial in enumerate(fit.trials) if trial.trial.group(shared) == shape.group]
-    changed = predictor.run_as(predictor.layout.model + shape.effect, jobs.take(np.array(affected)))
+    changed = predictor.run(jobs[affected], model=predictor.layout.model + shape.effect)
     change = [np.zeros(before.time_s.size) for before in baseline]
     for i, trajectory in zip(affected, changed, strict=True):
         change[i] = position_change(baseline[i], trajectory)

@@ -122,13 +122,18 @@ class FitTrial:
         return float(np.mean(self.lead_position_m[: self.n_rest]))
 
     @cached_property
+    def typical_pressure_Pa(self) -> float:
+        """The set pressure, or the median of the recorded one."""
+        return self.trial.pressure_Pa if self.trace is None else float(np.median(np.interp(self.time_s, *self.trace)))
+
+    @cached_property
     def pressurised_in_recording(self) -> bool:
         """Whether the tube was pressurised during the recording; the trace then shows when the growth was started.
         Nothing else holds such a vine, and a free release would stand in for a threshold of the pressure.
         """
         # 0.5: where a trace begins below this part of its median, the tube was pressurised during the
         # recording (chosen)
-        return self.trace is not None and bool(self.trace[1][0] < 0.5 * np.median(self.trace[1]))
+        return self.trace is not None and bool(self.trace[1][0] < 0.5 * self.typical_pressure_Pa)
 
 
 Pairs = Iterable[tuple[Trial, Track]]
@@ -186,7 +191,7 @@ def prepare_trial(
             " or see in its overlay what hides the edge"
         )
     denoised = denoised or denoised_traces([track])[0]
-    extended = None if denoised is None else denoised.extended()
+    extended = None if denoised is None else denoised.extended().thinned()
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
     # 1.5: A point later than this many frames after the previous one begins a new stretch, whose noise is

@@ -395,6 +395,30 @@ class DenoisedTrace:
             errors_Pa=np.vstack([self.errors_Pa, end[1:]]),
         )
 
+    def thinned(self) -> DenoisedTrace:
+        """The samples from which lines give all others, since a simulation stops at each (Ramer, Computer Graphics and
+        Image Processing 1, 244, 1972).
+        """
+        curves = np.column_stack([self.pressure_Pa, self.errors_Pa])
+        kept, spans = {0, len(curves) - 1}, [(0, len(curves) - 1)]
+        while spans:
+            begin, end = spans.pop()
+            part = (self.time_s[begin : end + 1] - self.time_s[begin]) / (self.time_s[end] - self.time_s[begin])
+            line = curves[begin] + part[:, None] * (curves[end] - curves[begin])
+            distance_Pa = np.max(np.abs(curves[begin : end + 1] - line), axis=1)
+            farthest = begin + int(np.argmax(distance_Pa))
+            # 1e-5: distance from a line, relative to the median pressure, that no position shows (derived)
+            if distance_Pa[farthest - begin] > 1e-5 * abs(float(np.median(self.pressure_Pa))):
+                kept.add(farthest)
+                spans += [(begin, farthest), (farthest, end)]
+        places = sorted(kept)
+        return replace(
+            self,
+            time_s=self.time_s[places],
+            pressure_Pa=self.pressure_Pa[places],
+            errors_Pa=self.errors_Pa[places],
+        )
+
 
 @dataclass(frozen=True)
 class Growth:
@@ -484,14 +508,15 @@ def kinds_of_curves() -> tuple[list[Floats], ...]:
 
 def curves_of(factors: Floats, *kinds: Sequence[Floats]) -> tuple[Floats, Posterior]:
     """Products of splines and readings, the constant eliminated, and the posterior of the coefficients over kinds of
-    curves, each sort with the same odds. Shapes: factors (n_traces, q + 2, q + 2) → (n_traces, q + 1, q + 1).
+    curves, each sort with the same odds, and no curve, since a regulator keeps most pressures constant, with those of
+    all together. Shapes: factors (n_traces, q + 2, q + 2) → (n_traces, q + 1, q + 1).
     """
     rows = factors[:, 1:, 1:]
     products = np.swapaxes(rows, 1, 2) @ rows
-    log_odds = [-math.log(len(sort)) for sort in kinds for _ in sort]
+    log_odds = [math.log(len(kinds)), *(-math.log(len(sort)) for sort in kinds for _ in sort)]
     # Amplitudes of the smooth functions, parts of the absolute pressure (chosen)
     amplitudes = np.geomspace(1e-6, 0.3, 16)
-    modes = [each for sort in kinds for each in sort]
+    modes = [np.zeros((rows.shape[2] - 1, 1)), *itertools.chain(*kinds)]
     return products, posterior(products[:, :-1, :-1], products[:, :-1, -1], modes, amplitudes, log_odds)
 
 

@@ -165,10 +165,9 @@ def _changes_of(predictor: Predictor, solution: Solution, changed: Mapping[int, 
     """Changes of the positions of some trials, m, by index, if they were as given; none where one cannot be
     simulated.
     """
-    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
-    jobs = [jobs[i] for i in changed]
-    if not jobs:
+    if not changed:
         return {}
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)[list(changed)]
     data = [replace(each, trial=changed.get(i, each.trial)) for i, each in enumerate(predictor.data)]
     try:
         plain, moved = predictor.run(jobs), Predictor(predictor.layout, data, predictor.host).run(jobs)
@@ -212,7 +211,7 @@ def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
                 clock_s, pressure_Pa = data[i].trace or (np.zeros(0), np.zeros(0))
                 varied[i] = replace(data[i], trace=(clock_s, pressure_Pa + errors_Pa[i][:, k]))
             other = Predictor(predictor.layout, varied, predictor.host)
-            for i, perturbed in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
+            for i, perturbed in zip(rows, other.run(jobs[rows]), strict=True):
                 columns[i][:, k] = position_change(plain[i], perturbed)
                 places[i, k] = begins[i] + k
     except SimulationError:

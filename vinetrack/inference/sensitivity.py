@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from vinetrack.dynamics.simulate import (
     Trajectory,
     bends_of,
     check_completed,
-    simulate_many,
     trajectories,
 )
 from vinetrack.effects import TrialInputs
@@ -39,32 +38,17 @@ from vinetrack.inference.gaussian_processes import all_products
 OBSERVED = 3  # Column of `Motions.rows` with the position of the edge as the camera reports it (defined)
 
 
-class Job(NamedTuple):
-    """One trajectory to simulate: its trial, parameters, pressures and release."""
-
-    trial: int
-    row: Floats
-    yield_pressure_Pa: float
-    pressure_deviation: float
-    release_s: float
-
-
 @dataclass(frozen=True)
 class Jobs:
-    """Trajectories to simulate, one entry of each array per job; `row` has shape (n_jobs, n_parameters), SI."""
+    """Trajectories to simulate, one entry of each array per job; `row` has shape (n_jobs, n_parameters), SI. An index
+    gives one of them or a copy of several.
+    """
 
     trial: NDArray[np.int_]
     row: Floats
     yield_pressure_Pa: Floats
     pressure_deviation: Floats
     release_s: Floats
-
-    @classmethod
-    def of(cls, jobs: Sequence[Job]) -> Jobs:
-        """Combine single jobs."""
-        trials, rows, *values = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
-        others = [np.array(column, dtype=float) for column in values]
-        return cls(np.array(trials, dtype=int), np.array(rows).reshape(len(jobs), -1), *others)
 
     def with_effect(self, values: Sequence[float]) -> Jobs:
         """The same trajectories for a model with one more effect."""
@@ -73,25 +57,16 @@ class Jobs:
     def __len__(self) -> int:
         return self.trial.size
 
-    def take(self, places: NDArray[np.int_]) -> Jobs:
-        """A copy of some of the jobs. Shapes: places (n_taken,)."""
-        trial, *numbers = self._columns
-        return Jobs(trial[places], *(values[places] for values in numbers))
+    def __getitem__(self, places: int | slice | list[int] | NDArray[np.int_]) -> Jobs:
+        return Jobs(*(values[places] for values in vars(self).values()))
 
-    def as_list(self) -> list[Job]:
-        """The jobs as a list."""
-        rows, *columns = self.row, *(values.tolist() for values in self._columns[2:])
-        return [Job(i, row, *numbers) for i, row, *numbers in zip(self.trial.tolist(), rows, *columns, strict=True)]
+    def __iter__(self) -> Iterator[Jobs]:
+        return (self[i] for i in range(len(self)))
 
     @classmethod
     def concatenated(cls, parts: Sequence[Jobs]) -> Jobs:
         """Concatenate several sets of jobs."""
-        trial, *numbers = (np.concatenate(values) for values in zip(*(part._columns for part in parts), strict=True))
-        return cls(trial, *numbers)
-
-    @property
-    def _columns(self) -> tuple[NDArray[Any], ...]:
-        return tuple(vars(self).values())
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 class Average(NamedTuple):
@@ -241,16 +216,11 @@ class Predictor:
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
-    def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate at the times of each job's trial, or at `times_s`."""
-        return self.run_as(self.layout.model, Jobs.of(jobs), times_s)
+    def run(self, jobs: Jobs, times_s: Sequence[Floats] | None = None, model: Model | None = None) -> list[Trajectory]:
+        """Simulate at the times of each job's trial, or at `times_s`, by the model of the fit or another one."""
+        return self._simulated(jobs, times_s, model).trajectories()
 
-    def run_as(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate another model for the same trials."""
-        return self._simulated(model, jobs, times_s).trajectories()
-
-    def _simulated(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> Motions:
-        """Trajectories of the jobs."""
+    def _simulated(self, jobs: Jobs, times_s: Sequence[Floats] | None = None, model: Model | None = None) -> Motions:
         trials = jobs.trial
         inputs = with_pressures(
             self.inputs[trials], self.inputs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
@@ -260,7 +230,7 @@ class Predictor:
             times_s = [average.instants_s for average in averages] or [self.times_s[i] for i in trials]
         starts = starts_of(times_s)
         batch = lay_out(
-            model,
+            model or self.layout.model,
             inputs,
             [self.bends[i] for i in trials],
             np.concatenate(times_s) - np.repeat(jobs.release_s, np.diff(starts)),
@@ -282,14 +252,10 @@ class Predictor:
             for trace, release_s, deviation in zip(traces, jobs.release_s, jobs.pressure_deviation, strict=True)
         ]
 
-    def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
+    def jobs(self, theta: Floats, trial_effects: Floats) -> Jobs:
         """Simulation jobs at given parameters and trial effects. Shapes: theta (n_free,); trial_effects
         (n_trials, 4).
         """
-        return self.job_arrays(theta, trial_effects).as_list()
-
-    def job_arrays(self, theta: Floats, trial_effects: Floats) -> Jobs:
-        """As `jobs`, in the form of arrays. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
         deviations = trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] + self.layout.shifts(theta)
         if self.damping_column >= 0:
@@ -298,7 +264,7 @@ class Predictor:
 
     def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
         """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
-        return self.run_as(self.layout.model, self.job_arrays(theta, trial_effects))
+        return self.run(self.jobs(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted positions of every trial. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
@@ -311,9 +277,7 @@ class Predictor:
         effect_sets (n_trials, 4) → (n_points,).
         """
         count = len(self.data)
-        motions = self._simulated(
-            self.layout.model, Jobs.concatenated([self.job_arrays(theta, effects) for effects in effect_sets])
-        )
+        motions = self._simulated(Jobs.concatenated([self.jobs(theta, effects) for effects in effect_sets]))
         observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(effect_sets))]
         return [
             self.by_trial(self._residuals(observed_of_set, effects))
@@ -337,11 +301,9 @@ class Predictor:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
         (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
-        unperturbed = self.job_arrays(theta, trial_effects)
+        unperturbed = self.jobs(theta, trial_effects)
         perturbations = list(self._perturbations(unperturbed, theta, trial_effects, trial_effects_only))
-        motions = self._simulated(
-            self.layout.model, Jobs.concatenated([unperturbed, *(perturbed for _, _, perturbed in perturbations)])
-        )
+        motions = self._simulated(Jobs.concatenated([unperturbed, *(jobs for _, _, jobs in perturbations)]))
         count = len(self.data)
         rows = motions.rows(0, count)
         table = np.zeros((rows.shape[0], N_TRIAL_EFFECTS + len(self.layout.keys) + 1))
@@ -418,13 +380,13 @@ class Predictor:
         """For each column to be differenced: its place, the step of each trial, and the perturbed jobs."""
         damping_step = 1e-3  # Relative step of B (derived)
         if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
-            steps, perturbed = RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed.take(shifted_trials)
+            steps, perturbed = RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed[shifted_trials]
             yield RELEASE, steps, replace(perturbed, release_s=perturbed.release_s + steps)
         if len(pressure_trials := np.flatnonzero(self.has_pressure_deviation)):
-            steps, perturbed = self.pressure_step[pressure_trials], unperturbed.take(pressure_trials)
+            steps, perturbed = self.pressure_step[pressure_trials], unperturbed[pressure_trials]
             yield PRESSURE, steps, replace(perturbed, pressure_deviation=perturbed.pressure_deviation + steps)
         if DAMPING not in self.layout.keys and len(damping_trials := np.flatnonzero(self.has_damping_deviation)):
-            perturbed = unperturbed.take(damping_trials)
+            perturbed = unperturbed[damping_trials]
             perturbed.row[:, self.damping_column] *= np.exp(damping_step)
             yield DAMPING_DEVIATION, np.full(damping_trials.size, damping_step), perturbed
         upper = self.layout.bounds[1]
@@ -437,7 +399,7 @@ class Predictor:
             steps = np.where(theta[places] + step > upper[places], -step, step)
             perturbed_theta = theta.copy()
             perturbed_theta[places] = theta[places] + steps
-            perturbed = self.job_arrays(perturbed_theta, trial_effects).take(trials_of_key)
+            perturbed = self.jobs(perturbed_theta, trial_effects)[trials_of_key]
             yield N_TRIAL_EFFECTS + column, steps, perturbed
 
 
@@ -556,7 +518,7 @@ def middle_speed(trial_data: FitTrial) -> float:
 def _driving_force_N(trial_data: FitTrial) -> float:
     """Force on the tip above the yield force, N, from the recorded pressure where there is one."""
     trial = trial_data.trial
-    pressure_Pa = float(np.median(trial_data.trace[1])) if trial_data.trace is not None else trial.pressure_Pa
+    pressure_Pa = trial_data.typical_pressure_Pa
     over_Pa = pressure_Pa - np.nan_to_num(trial.yield_pressure_Pa)
     return max(float(over_Pa) * trial.area_m2, 1e-3 * abs(pressure_Pa) * trial.area_m2, 1e-9)
 
@@ -576,17 +538,7 @@ def align(
         for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
     grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
-    trajectories = simulate_many(
-        predictor.layout.model,
-        [trial_data.trial for trial_data in data],
-        grids,
-        traces=[
-            None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
-            for trial_data, job in zip(data, jobs, strict=True)
-        ],
-        parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
-        host=predictor.host,
-    )
+    trajectories = predictor.run(jobs, [grid_s + at_s for grid_s, at_s in zip(grids, jobs.release_s, strict=True)])
     best, misfit = trial_effects.copy(), np.zeros(len(data))
     for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
         if trial_data.pressurised_in_recording:

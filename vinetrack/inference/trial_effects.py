@@ -251,7 +251,7 @@ class ReleaseSearch:
         if not places:
             return None
         releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
-        jobs = predictor.job_arrays(state.theta, state.trial_effects).take(np.array(places))
+        jobs = predictor.jobs(state.theta, state.trial_effects)[places]
         sensitivities = _release_sensitivities(predictor, jobs, releases)
         trial_effects = state.trial_effects.copy()
         centre, precision = trial_effect_prior(problem, state)
@@ -358,7 +358,7 @@ def _release_sensitivities(
     damping_step, pressure_step = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
     with_pressure = predictor.has_pressure_deviation[plain.trial]
     with_damping = predictor.has_damping_deviation[plain.trial]
-    pressures, dampings = plain.take(np.flatnonzero(with_pressure)), plain.take(np.flatnonzero(with_damping))
+    pressures, dampings = plain[np.flatnonzero(with_pressure)], plain[np.flatnonzero(with_damping)]
     pressures = replace(pressures, pressure_deviation=pressures.pressure_deviation + pressure_step)
     dampings.row[:, predictor.damping_column] *= np.exp(damping_step)
     longest_s = np.array([predictor.data[i].time_s[-1] - s.min() for i, s in zip(plain.trial, releases, strict=True)])
@@ -366,7 +366,7 @@ def _release_sensitivities(
     grids = longest_s * np.linspace(0.0, 1.0, 600)[:, None] ** 1.5
     grids = np.concatenate([grids.T, grids.T[with_pressure], grids.T[with_damping]])
     jobs = Jobs.concatenated([plain, pressures, dampings])
-    moved = predictor.run_as(predictor.layout.model, jobs, list(jobs.release_s[:, None] + grids))
+    moved = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
     y = np.array([trajectory.observed_position_m for trajectory in moved])
     n, n_pressures = len(plain), len(pressures)
     sensitivities = np.zeros((n, N_TRIAL_EFFECTS, grids.shape[1]))

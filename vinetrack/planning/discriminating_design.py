@@ -43,7 +43,7 @@ from vinetrack.inference.sensitivity import (
     N_TRIAL_EFFECTS,
     ORIGIN,
     RELEASE,
-    Job,
+    Jobs,
     Predictor,
     initial_trial_effects,
 )
@@ -405,7 +405,7 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[float | None]:
     return growth
 
 
-def _simulated(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | None]:
+def _simulated(predictor: Predictor, jobs: Jobs) -> list[Trajectory | None]:
     """Trajectories of all jobs; None for those that cannot be simulated, found by bisection."""
     try:
         return list(predictor.run(jobs))
@@ -416,13 +416,13 @@ def _simulated(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | N
     return _simulated(predictor, jobs[:middle]) + _simulated(predictor, jobs[middle:])
 
 
-def _speed_ratio(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:
+def _speed_ratio(fit: Fit, trial: Trial, job: Jobs, tail_velocity_m_s: Floats) -> float:
     """Ratio of the largest tail speed to the steady speed without payload; 0 where the model has no damping."""
     names = fit.model.parameter_names
     if DAMPING not in names or EXPONENT not in names:
         return 0.0
     B, n = (float(job.row[names.index(key)]) for key in (DAMPING, EXPONENT))
-    yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
+    yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
     drive_N = (trial.pressure_Pa - yield_Pa) * trial.area_m2
     if not (drive_N > 0 and B > 0 and n > 0.05):
         return math.inf if not drive_N > 0 else 0.0
