@@ -207,8 +207,8 @@ def rgb(colour: str) -> np.ndarray:
 
 EDGES = [
     overlay.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
-    overlay.Edge("initial model", BEFORE, np.array([0.0, 300.0]), np.array([0.0, 25.0])),
-    overlay.Edge("with air drag", AFTER, np.array([0.0, 210.0]), np.array([0.0, math.nan])),
+    overlay.Edge("initial model", BEFORE, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
+    overlay.Edge("with air drag", AFTER, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
 ]
 
 
@@ -222,9 +222,9 @@ EDGES = [
     ids=["along", "larger", "down"],
 )
 def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(axis, size, width_px):
-    view, grey = overlay.ClipView("a", axis, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
+    view, grey = overlay.ClipView("a", axis, EDGES, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
     zoom = width_px / size[0]
-    unseen, picture = (overlay.compose(view, grey, frame, 12.0, EDGES)[-round(zoom * size[1]) :] for frame in (0, 1))
+    unseen, picture = (overlay.compose(view, grey, frame, 12.0)[-round(zoom * size[1]) :] for frame in (0, 1))
     assert picture.shape[1] == width_px
     across = 0 if axis.from_px[1] == axis.to_px[1] else 1
     for colour, place in ((TRACKED, 220), (BEFORE, 320), (AFTER, 230)):

@@ -20,7 +20,7 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, draw_strip
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, draw_strip
 from vinetrack.pipeline import overlays_stage
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.pipeline.trials import analyse_trials
@@ -313,8 +313,8 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
     _, results = campaign(tmp_path)
     drawn: list[np.ndarray] = []
 
-    def seen(_view: object, picture: np.ndarray, frame: int, _time_ms: float, edges: list[Edge]) -> np.ndarray:
-        drawn.append(np.array([edge.along_px[frame] for edge in edges]))
+    def seen(view: ClipView, picture: np.ndarray, frame: int, _time_ms: float) -> np.ndarray:
+        drawn.append(np.array([edge.along_px[frame] for edge in view.edges]))
         return np.repeat(picture[:, :, None], 3, axis=2)
 
     monkeypatch.setattr("vinetrack.pipeline.overlays_stage.compose", seen)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from vinetrack.figures import style as st
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from PIL.ImageDraw import ImageDraw
+    from PIL.Image import Image
     from PIL.ImageFont import FreeTypeFont
 
     from vinetrack.video.axis import Axis
@@ -106,31 +106,33 @@ def _draw_frame(panel: st.Panel, tracking: Tracking, frame: int, picture: np.nda
 # ------------------------------------------------------------------------------
 # Frames of a clip.
 
-# Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey
-TRACKED, BEFORE, AFTER = "#F0E442", st.VERMILLION, st.SKY
+TRACKED, BEFORE, AFTER = "#F0E442", st.VERMILLION, st.SKY  # of Okabe and Ito: everyone tells them apart on any grey
 _BAR, _BAR_INK, _GREY = "#16191e", "#f2f4f7", "#9aa3b0"
 
 
 @dataclass(frozen=True)
 class Edge:
     """One edge in a clip: its name, its colour, and its position along the axis in every frame, px (NaN: none).
-    `off_mm` is its distance ahead of the tracked edge in every frame, None for the tracked edge itself; `by_hand` marks
-    the tracked edge at points corrected by hand.
+    `off_mm` is its distance ahead of the tracked edge in every frame, None for the tracked edge itself. The line of an
+    edge that was seen crosses the tube; that of a model stands on both sides of it, to `reach` radii from the axis.
     """
 
     name: str
     colour: str
     along_px: Floats
     off_mm: Floats | None = None
-    by_hand: bool = False
+    reach: float = 0.0
 
 
 @dataclass(frozen=True)
 class ClipView:
-    """Layout of all frames of a clip: size of the recording, scale along the axis, factor of the slow motion."""
+    """What all frames of a clip have in common: edges, size of the recording, scale along the axis, factor of the slow
+    motion.
+    """
 
     title: str
     axis: Axis
+    edges: list[Edge]
     tube_px: float
     size_px: tuple[int, int]
     mm_per_px: float
@@ -154,97 +156,95 @@ class ClipView:
 
     def row_y(self, row: int) -> float:
         """Height of the middle of a line of text in the bar."""
-        return 1.1 * self.line_px + 1.35 * self.line_px * row
+        return (1.1 + 1.35 * row) * self.line_px
 
     def at(self, along_px: Any, across_px: float = 0.0) -> Any:
         """Places of the clip along the axis; pixel centres are at integers in the recording, at halves in the clip."""
         return (self.axis.points(along_px, across_px) + 0.5) * self.zoom - 0.5
+
+    @cached_property
+    def bar(self) -> Image:
+        """The bar above the picture with what is the same in every frame: names of the edges, title."""
+        from PIL import Image, ImageDraw
+
+        width, line_px = self.picture_px[0], self.line_px
+        bar = Image.new("RGB", (width, _even(1.35 * line_px * max(len(self.edges), 2) + 0.8 * line_px)), _BAR)
+        pen = ImageDraw.Draw(bar)
+        for i, edge in enumerate(self.edges):
+            y, font = self.row_y(i), _font(line_px, edge.name, 0.42 * width)
+            pen.line([(line_px, y), (2.6 * line_px, y)], fill=edge.colour, width=max(line_px // 4, 3))
+            pen.text((3.2 * line_px, y), edge.name, font=font, fill=_BAR_INK, anchor="lm")
+        font = _font(line_px, self.title, 0.3 * width)
+        pen.text((width - line_px, self.row_y(0)), self.title, font=font, fill=_BAR_INK, anchor="rm")
+        return bar
+
+    @cached_property
+    def scale_bar(self) -> Image:
+        """A scale bar of a round length, about a sixth of the picture, for its lower left corner."""
+        from PIL import Image, ImageDraw
+
+        width, height, thick = self.picture_px[0], 3 * self.line_px, max(self.line_px // 6, 2)
+        bar = Image.new("RGBA", (width, height))
+        wanted_mm = width / 6 / self.zoom * self.mm_per_px
+        if not 0 < wanted_mm < math.inf:
+            return bar.crop((0, 0, 1, height))
+        decade = 10.0 ** math.floor(math.log10(wanted_mm))
+        length_mm = max(step * decade for step in (1, 2, 5) if step * decade <= wanted_mm)
+        left, bottom = self.line_px, height - self.line_px
+        right, pen = left + length_mm / self.mm_per_px * self.zoom, ImageDraw.Draw(bar)
+        pen.rectangle((left - 1, bottom - thick - 1, right + 1, bottom + 1), fill="black")
+        pen.rectangle((left, bottom - thick, right, bottom), fill="white")
+        style: dict[str, Any] = {"fill": "white", "anchor": "ls", "stroke_width": 2, "stroke_fill": "black"}
+        pen.text((left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(self.line_px), **style)
+        return bar.crop((0, 0, width // 2, height))
 
 
 def _even(value: float) -> int:
     return max(2 * round(value / 2), 2)
 
 
-def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
+def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float) -> NDArray[np.uint8]:
     """Draw one frame of the clip, RGB, with even height and width. Shape (height, width, 3)."""
     from PIL import Image, ImageDraw
 
     width, height = view.picture_px
-    bar_px = _even(1.35 * view.line_px * max(len(edges), 2) + 0.8 * view.line_px)
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
     if view.axis.bends:  # a straight axis is obvious
         pen.line([tuple(place) for place in view.at(np.arange(0.0, view.axis.length_px, 3.0))], fill=_GREY, width=1)
-    models = [edge for edge in edges[1:] if not edge.by_hand]
-    seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
-    # Edges that were seen cross the tube; those of the models before and after stand on both sides of it, up to other
-    # distances from the axis, in radii of the tube.
-    thick = max(round(view.picture_px[0] / 320), 3)
-    for edge, reach in (*zip(models, (2.0, 1.4), strict=False), *((edge, 0.0) for edge in seen)):
+    thick = max(round(width / 320), 3)
+    for edge in sorted(view.edges, key=lambda edge: -edge.reach):
         along = float(edge.along_px[frame])
-        spans = ((0.85, reach), (-0.85, -reach)) if reach else ((-1.0, 1.0),)
+        spans = ((0.85, edge.reach), (-0.85, -edge.reach)) if edge.reach else ((-1.0, 1.0),)
         for span in spans if math.isfinite(along) else ():
             line = [tuple(view.at(np.array(along), across * 0.5 * view.tube_px)) for across in span]
             pen.line(line, fill="black", width=thick + 2)
             pen.line(line, fill=edge.colour, width=thick)
-    _scale_bar(pen, view)
-    whole = Image.new("RGB", (width, height + bar_px), _BAR)
-    whole.paste(small, (0, bar_px))
-    _write_bar(ImageDraw.Draw(whole), view, edges, frame, time_ms)
-    return np.asarray(whole)
-
-
-@lru_cache(maxsize=8)
-def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
-    from matplotlib import get_data_path
-    from PIL import ImageFont
-
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
-
-
-def _scale_bar(pen: ImageDraw, view: ClipView) -> None:
-    """Draw a scale bar of a round length, about a sixth of the picture, in the lower left corner."""
-    width, height = view.picture_px
-    wanted_mm = width / 6 / view.zoom * view.mm_per_px
-    if not math.isfinite(wanted_mm) or wanted_mm <= 0:
-        return
-    decade = 10.0 ** math.floor(math.log10(wanted_mm))
-    length_mm = max(step * decade for step in (1, 2, 5) if step * decade <= wanted_mm)
-    left, bottom = view.line_px, height - view.line_px
-    right = left + length_mm / view.mm_per_px * view.zoom
-    thick = max(view.line_px // 6, 2)
-    pen.rectangle((left - 1, bottom - thick - 1, right + 1, bottom + 1), fill="black")
-    pen.rectangle((left, bottom - thick, right, bottom), fill="white")
-    style: dict[str, Any] = {"fill": "white", "anchor": "ls", "stroke_width": 2, "stroke_fill": "black"}
-    pen.text((left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(view.line_px), **style)
-
-
-def _write_bar(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float) -> None:
-    """Write names and errors of the edges at the left of the bar above, the title and the time at its right."""
-    width, line_px, font, bold = view.picture_px[0], view.line_px, _font(view.line_px), _font(view.line_px, True)
-    for i, edge in enumerate(edges):
-        y = view.row_y(i)
-        pen.line([(line_px, y), (2.6 * line_px, y)], fill=edge.colour, width=max(line_px // 4, 3))
-        pen.text((3.2 * line_px, y), _shortened(edge.name, 0.42 * width, font), font=font, fill=_BAR_INK, anchor="lm")
+    small.paste(view.scale_bar, (0, height - view.scale_bar.height), view.scale_bar)
+    whole = Image.new("RGB", (width, height + view.bar.height))
+    whole.paste(view.bar)
+    whole.paste(small, (0, view.bar.height))
+    pen, font = ImageDraw.Draw(whole), _font(view.line_px)
+    for i, edge in enumerate(view.edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
             words = f"{st.with_minus(edge.off_mm[frame], '+.1f')} mm"
-            pen.text((0.6 * width, y), words, font=font, fill=_BAR_INK, anchor="rm")
-    right, title = width - line_px, _shortened(view.title, 0.3 * width, bold)
-    pen.text((right, view.row_y(0)), title, font=bold, fill=_BAR_INK, anchor="rm")
+            pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=_BAR_INK, anchor="rm")
     words = f"frame {frame}"
     if math.isfinite(time_ms):
         before = " (before release)" if time_ms < 0 else ""
         words = f"{st.with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
-    pen.text((right, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
+    pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
+    return np.asarray(whole)
 
 
-def _shortened(text: str, room_px: float, font: FreeTypeFont) -> str:
-    if font.getlength(text) <= room_px:
-        return text
-    while text and font.getlength(text + "…") > room_px:
-        text = text[:-1]
-    return text.rstrip() + "…"
+@lru_cache(maxsize=8)
+def _font(size_px: float, words: str = "", room_px: float = math.inf) -> FreeTypeFont:
+    """Letters of this height, or smaller ones in which the words fit the room."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    size_px = st.fitting_size(words, room_px, size_px, bold=False)
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size_px)
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:

@@ -133,13 +133,13 @@ def _write_clip(
             if frame in shown[::stride]:
                 if high == low:
                     low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
-                yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]), edges)
+                yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]))
 
     rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
     play_fps, stride = playback_rate(len(shown), settings.seconds)
     size = recording.width, recording.height
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
-    view = ClipView(title, axis, tube_px, size, mm_per_px, rate / play_fps / stride, settings.width_px)
+    view = ClipView(title, axis, edges, tube_px, size, mm_per_px, rate / play_fps / stride, settings.width_px)
     write_clip(path, drawn(), play_fps)
 
 
@@ -178,21 +178,21 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
         predicted, to_px = read_result(path), position_to_px(track)
         diagnosis = read_diagnosis(results)
         added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
-        models = [("model_before_m", "initial model", BEFORE)]
-        models += [("model_after_m", f"with {added}", AFTER)] if added else []
+        models = [("model_before_m", "initial model", BEFORE, 2.0)]
+        models += [("model_after_m", f"with {added}", AFTER, 1.4)] if added else []
         time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
-        for column, label, colour in models:
+        for column, label, colour, reach in models:
             prediction = predicted[["time_s", column]].dropna()
             if not prediction.empty:
                 # There is no prediction before the first and after the last frame of the fit.
                 ends = {"left": math.nan, "right": math.nan}
                 position_m = np.interp(time_s, prediction["time_s"], prediction[column], **ends)
-                edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m)))
+                edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m), reach))
         fitted = read_fit(results).trials if results.fit.exists() else {}
         release_s = fitted[trial].release_s if trial in fitted else release_s
     by_hand = with_flag(track["flag"], "corrected")
     if by_hand.any():
-        edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True))
+        edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan)))
     return edges, release_s
 
 

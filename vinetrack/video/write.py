@@ -16,6 +16,7 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
     Returns their number.
     """
     import av
+    import cv2
 
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".part-{path.name}")
@@ -33,10 +34,10 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
                     options = {"preset": "veryfast", "crf": "26", "profile": "high", "tune": "animation"}
                     stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
                     context.thread_count = 1
-                    # 1 is the code of ITU-R BT.709 in the stream.
-                    context.colorspace = context.color_primaries = context.color_trc = 1
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-                frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
+                    # 6 is the code of ITU-R BT.601 in the stream, by which OpenCV converts.
+                    context.colorspace = context.color_primaries = context.color_trc = 6
+                planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
+                frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
                 frame.pts = count - 1
                 container.mux(stream.encode(frame))
             if stream is None:
