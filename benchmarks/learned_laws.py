@@ -36,8 +36,7 @@ import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import FittedMotion
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out
-from vinetrack.diagnosis.learned_force import LearnedForce
-from vinetrack.diagnosis.missing_force import missing_force
+from vinetrack.diagnosis.missing_force import LearnedForce, missing_force
 from vinetrack.diagnosis.propose import propose
 
 LAWS = {"slip": "growth+speed", "chirp": "growth", "squeeze": "growth+pressure"}

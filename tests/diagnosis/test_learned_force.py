@@ -14,7 +14,7 @@ import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import force_inversion as inversion
 from vinetrack.diagnosis import force_laws as laws
-from vinetrack.diagnosis import learned_force
+from vinetrack.diagnosis import missing_force as learning
 from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_text
 from vinetrack.diagnosis.replicates import align_trials
@@ -23,7 +23,7 @@ from vinetrack.effects import own_effects
 from vinetrack.inference import gaussian_processes as smooth
 from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
-GROWTH = learned_force.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
+GROWTH = learning.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
@@ -74,7 +74,7 @@ def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparamet
     design = smooth.splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
     sizes, hypotheses = np.geomspace(0.1, 3.0, 4), GROWTH.hypotheses
-    assert {start for start, _ in hypotheses} == {learned_force.ZERO_AT_START, learned_force.CONSTANT_AT_START}
+    assert {start for start, _ in hypotheses} == {learning.ZERO_AT_START, learning.CONSTANT_AT_START}
     modes = [GROWTH.modes(*each) for each in hypotheses]
     found = smooth.posterior(design.T @ design, design.T @ positions, modes, sizes)
     logs, means, covariances = [], [], []
@@ -101,7 +101,7 @@ def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparamet
 
 
 def test_one_variable_and_two_have_equal_prior_odds():
-    weights = learned_force.variable_weights(dict.fromkeys(("growth", "growth+speed", "growth+time"), 3.0))
+    weights = learning.variable_weights(dict.fromkeys(("growth", "growth+speed", "growth+time"), 3.0))
     assert weights["growth"] == pytest.approx(0.5)
     assert weights["growth+speed"] == pytest.approx(0.25)
 
@@ -122,7 +122,7 @@ def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_p
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks, theta = slowed.tracks, slowed.tracks.theta
-    domains = learned_force.candidate_domains(tracks.motions)
+    domains = learning.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))
     growth, pressure = (smooth.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
@@ -216,13 +216,13 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
 
 
 DOMAINS = [
-    learned_force.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
-    learned_force.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
-    learned_force.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+    learning.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
+    learning.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
+    learning.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
 ]
 
 
-def learned(domain: learned_force.Domain, seed: int) -> learned_force.LearnedForce:
+def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:
     count = math.prod(domain.counts)
     known = np.random.default_rng(seed).standard_normal(count), np.eye(count) * 1e-4
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4, "is_visited": True}
@@ -230,8 +230,8 @@ def learned(domain: learned_force.Domain, seed: int) -> learned_force.LearnedFor
     motion.trial = SimpleNamespace(condition="one")
     found, lengths = smooth.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
     weights = {domain.name: 1.0}
-    return learned_force.LearnedForce(
-        domain, found, learned_force.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, 0.0, True
+    return learning.LearnedForce(
+        domain, found, learning.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, 0.0, True
     )
 
 

@@ -378,7 +378,6 @@ class ForceProblem:
         self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
         # A parameter without prior and information stays where it is.
         self.precision = np.maximum(self.prior.prior_precision, 1e-12)
-        self.conditions = list(dict.fromkeys(trial_data.trial.condition for trial_data in self.data))
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
@@ -451,7 +450,7 @@ class ForceEquations:
             for motion, columns, push in zip(point.motions, point.by_parameters, pushes, strict=True)
         ]  # fmt: skip
         sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
-        self.blocks = np.zeros((len(problem.conditions), p + q + 1, p + q + 1))
+        total = np.zeros((p + q + 1, p + q + 1))
         self.of_effects, of_trials = [], []
         for i, of_trial in enumerate(sensitivities):
             index = problem.prior.index[i]
@@ -460,13 +459,11 @@ class ForceEquations:
             block, response = self._without_effects(i, of_trial)
             of_trials.append(block)
             places = places[known]
-            condition = problem.conditions.index(problem.data[i].trial.condition)
-            self.blocks[condition][np.ix_(places, places)] += block[np.ix_(known, known)]
+            total[np.ix_(places, places)] += block[np.ix_(known, known)]
             self.of_effects.append((places, response[:, known]))
         self.of_trials = np.array(of_trials)
         held = np.flatnonzero(~problem.prior.free)
-        self.blocks[:, held] = self.blocks[:, :, held] = 0.0
-        total = self.blocks.sum(axis=0)
+        total[held] = total[:, held] = 0.0
         own = np.diag(total)[p:-1]
         self.ridge = LEAST_INFORMATION * np.maximum(own, max(1e-6 * own.max(), 1e-300))
         reduced, self.of_parameters = self._without_parameters(total, np.diag(total)[:p].copy())
@@ -532,28 +529,6 @@ class ForceEquations:
         variance = max(float(np.trace(covariance)), float(np.trace(robust))) / change.size
         dof = float(np.trace(covariance @ information))
         return ForceEstimate(float(score @ change), change, math.sqrt(variance), shift, dof)
-
-    def gain_by_condition(self, shape: Floats) -> tuple[float, float]:
-        """Fall of χ² with combinations of the coefficients that differ between conditions, and its expectation under no
-        force. Shapes: shape (q, m).
-        """
-        p, m = self.point.theta.size, shape.shape[1]
-        change = np.zeros((self.blocks.shape[1], m + p + 1))
-        change[p:-1, :m], change[:p, m:-1], change[-1, -1] = shape, np.eye(p), 1.0
-        blocks = change.T @ self.blocks @ change
-        own = np.einsum("nkk->nk", blocks)[:, :m]
-        ridge = np.maximum(LEAST_INFORMATION * own, 1e-300 + 1e-6 * LEAST_INFORMATION * own.max())
-        known = np.einsum("nkk->k", blocks)[m : m + p]
-        reduced, _ = self._without_parameters(eliminated(blocks, ridge)[0].sum(axis=0), known)
-        return self.chi2 - float(reduced[-1, -1]), float(np.sum(own / (own + ridge)))
-
-    def by_condition(self, parameter_shift: Floats) -> tuple[Floats, Floats]:
-        """Information and score of the coefficients in every condition, the parameters shifted and then held. Shapes:
-        (n_conditions, q, q), (n_conditions, q).
-        """
-        p = self.point.theta.size
-        of_force = self.blocks[:, p:-1]
-        return of_force[:, :, p:-1], of_force[:, :, -1] - of_force[:, :, :p] @ parameter_shift
 
     def chi2_with(self, coefficients: Floats) -> float:
         """χ² with these coefficients, all other unknowns estimated anew."""

@@ -1,20 +1,23 @@
-"""The force that a model lacks: drawn against growth, speed, time and pressure, and compared with simple laws.
+"""The force that a model lacks: a smooth function of what it most likely depends on, and the simple law it resembles.
 
-Positions are never differentiated. The responses of the trajectories to a force are known
-(`vinetrack.diagnosis.force_inversion`); the force is then estimated by generalised least squares with the noise of the
-tracks. Release and origin of every trial are free, its pressure and B are free within the scatter of replicates, and B,
-n and all other model parameters are free. The motions are those under the force that is learned
-(`vinetrack.diagnosis.learned_force`).
-
-Part of any force can be taken over by B and n: the data do not decide between them and a freely drawn force. Where a
-simple law explains most of what is missing, B and n are set as they are with this law; otherwise they stay as fitted.
+The force is a Gaussian process over growth, speed, time since release or pressure, or over two of them together
+(`vinetrack.diagnosis.force_inversion`). Its coefficients are fitted to positions, through the response of the
+trajectory to a force, with B, n, yield pressures and the release, origin, pressure and B of every trial free, each
+under its own prior; positions are never differentiated. Choices of variables are compared by their marginal likelihood,
+averaged over amplitude, length scales and what the force may be where growth begins. Misfit that no force explains is
+treated as further noise. All choices are compared about the same motions: those on the tracks, then those under the
+force that leaves least, or those of the model where these leave less. There, too, simple laws are held against what the
+model lacks.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,27 +35,380 @@ from vinetrack.diagnosis.force_inversion import (
     settled,
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
-from vinetrack.diagnosis.learned_force import (
-    VARIABLES,
-    Domain,
-    LearnedForce,
-    amplitudes_N,
-    candidate_domains,
-    learned_force,
-)
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,
+    Posterior,
     posterior,
+    product_of_modes,
     root_of_covariance,
+    splines,
     standard_error,
 )
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# What a force may depend on, and the attribute of a motion that holds it
+VARIABLES = {
+    "growth": "lead_position_m",
+    "speed": "tail_velocity_m_s",
+    "time": "time_s",
+    "pressure": "pressure_Pa",
+}
+
+# What a force may be where growth begins. A force that is free there competes with B, n and P_y, and has to be worth a
+# Δχ² of the answer set: those are believed first.
+ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
+LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
+    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
+    """
+
+    variables: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    counts: tuple[int, ...]
+    log_scale: tuple[float, ...]
+
+    @property
+    def name(self) -> str:
+        """The variables joined by +: `growth`, `growth+speed`."""
+        return "+".join(self.variables)
+
+    @property
+    def start_axis(self) -> int:
+        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
+        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
+
+    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
+        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
+        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
+        """
+        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
+        return [
+            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
+            if math.isfinite(log_scale)
+            else (at - low) / (high - low)
+            for at, low, high, log_scale in limits
+        ]
+
+    def values_along(self, motion: FittedMotion) -> list[Floats]:
+        """The variables along a motion, SI, each of shape (n_times,)."""
+        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
+
+    def basis(self, values: Sequence[Floats]) -> Floats:
+        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, n_splines)."""
+        first, *others = [splines(at, count) for at, count in zip(self.normalised(values), self.counts, strict=True)]
+        for other in others:
+            first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
+        return first
+
+    def unit_push(self, motion: FittedMotion) -> Floats:
+        """The splines along a motion, shape (n_times, n_splines)."""
+        return self.basis(self.values_along(motion))
+
+    @property
+    def hypotheses(self) -> list[tuple[str, tuple[float, ...]]]:
+        """What the force may be where growth begins, with every combination of length scales."""
+        starts = list(LOG_ODDS) if len(self.variables) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
+        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.variables))
+        return list(itertools.product(starts if self.start_axis >= 0 else [FREE_AT_START], lengths))
+
+    def modes(self, at_start: str, lengths: Sequence[float]) -> Floats:
+        """Square root of the covariance of the coefficients at unit amplitude, shape (n_splines, n_modes)."""
+        start = self.start_axis
+        roots = [
+            root_of_covariance(count, length, k == start)
+            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
+        ]
+        modes = [product_of_modes(roots)]
+        if at_start == CONSTANT_AT_START:
+            modes.append(np.ones((math.prod(self.counts), 1)))
+        if at_start == FREE_AT_START and start >= 0:
+            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest (chosen)
+            roots[start] = np.full((self.counts[start], 1), 3.0)
+            modes.append(product_of_modes(roots))
+        return np.hstack(modes)
+
+
+def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
+    """Every variable alone, then every pair, over the ranges that the motions visit."""
+    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
+    ranges: dict[str, tuple[float, float, float]] = {}
+    for name, attribute in VARIABLES.items():
+        by_trial = [np.asarray(getattr(motion, attribute))[motion.is_visited] for motion in motions]
+        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
+        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
+        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
+        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
+        if high - low > 0.02 * abs(high):
+            if name == "pressure":
+                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
+            typical = float(np.median([np.median(values) for values in by_trial]))
+            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
+            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
+    # Splines along a variable, when it is alone and when it is one of two (chosen)
+    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
+    domains = []
+    for names in (*((name,) for name in ranges), *itertools.combinations(ranges, 2)):
+        counts = tuple((alone if len(names) == 1 else in_pair)[name] for name in names)
+        lows, highs, scales = zip(*(ranges[name] for name in names), strict=True)
+        domains.append(Domain(names, lows, highs, counts, scales))
+    return domains
+
+
+# ------------------------------------------------------------------------------
+# The choice of variables.
+#
+# Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
+# be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
+# prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
+
+# Part of χ² that is the unit of differences of ln Z where that is more than 1: so much depends on the prior (chosen)
+LEAST_DIFFERENCE = 5e-4
+
+LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A force over some variables. `equations` are those of its coefficients, `best` their least squares without regard
+    to how smooth the force is, `found` their posterior.
+    """
+
+    domain: Domain
+    equations: ForceEquations
+    best: ForceEstimate
+    found: Posterior
+
+    @property
+    def least_chi2(self) -> float:
+        """χ² of the best coefficients."""
+        return self.equations.chi2 - self.best.delta_chi2
+
+
+def amplitudes_N(motions: Sequence[FittedMotion]) -> Floats:
+    """Amplitudes of forces that are averaged over, N."""
+    drive_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
+    return drive_N * np.geomspace(0.003, 0.3, 9)  # Parts of the largest drive (chosen)
+
+
+def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
+    """All choices of variables about the motions of a point."""
+    domains = candidate_domains(point.motions)
+    equations = [ForceEquations(problem, point, domain.unit_push) for domain in domains]
+    best = [each.estimate() for each in equations]
+    inflation = problem.inflation(min(e.chi2 - b.delta_chi2 for e, b in zip(equations, best, strict=True)))
+    found = [coefficients_of(*each, inflation) for each in zip(domains, equations, strict=True)]
+    return [Choice(*each) for each in zip(domains, equations, best, found, strict=True)]
+
+
+def _least_chi2(choices: Sequence[Choice]) -> float:
+    return min(choice.least_chi2 for choice in choices)
+
+
+def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float, begins: str = "") -> Posterior:
+    """The posterior of the coefficients over a domain, their noise variance inflated; `begins`, of forces that are this
+    where growth begins.
+    """
+    hypotheses = [each for each in domain.hypotheses if begins in ("", each[0])]
+    return posterior(
+        equations.information / inflation,
+        (equations.score + equations.information @ equations.coefficients) / inflation,
+        [domain.modes(*each) for each in hypotheses],
+        amplitudes_N(equations.point.motions),
+        [LOG_ODDS[at_start] for at_start, _ in hypotheses],
+    )
+
+
+def variable_weights(log_evidence: Mapping[str, float], unit: float = 1.0) -> dict[str, float]:
+    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two; differences
+    of ln Z count in this unit. By name, highest first.
+    """
+    pairs, highest = sum("+" in name for name in log_evidence), max(log_evidence.values())
+    raw = {
+        name: math.exp((value - highest) / unit) / (pairs if "+" in name else len(log_evidence) - pairs)
+        for name, value in log_evidence.items()
+    }
+    return {name: value / sum(raw.values()) for name, value in sorted(raw.items(), key=lambda part: -part[1])}
+
+
+@dataclass(frozen=True)
+class LearnedForce:
+    """The missing force over the variables that it most likely depends on: the posterior of its coefficients, N, and
+    the most likely of the hypotheses that this averages over. `motions` are those of the trials at the solution.
+    """
+
+    domain: Domain
+    found: Posterior
+    at_start: str
+    length_scales: tuple[float, ...]
+    motions: Sequence[FittedMotion]
+    weights: Mapping[str, float]
+    not_excluded: tuple[str, ...]
+    log_bayes_factor: float
+    explained: float
+    undecided_N: float
+    is_repeated: bool
+
+    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.domain.basis(values)
+        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
+        import pandas as pd
+
+        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+        domain = self.domain
+        axes = [
+            np.linspace(low, high, plot_points[len(domain.variables) - 1])
+            for low, high in zip(domain.low, domain.high, strict=True)
+        ]
+        grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
+        trials = np.zeros(grid[0].size, dtype=int)
+        along: dict[str, list[Floats]] = {}
+        for motion in self.motions:
+            visited = domain.values_along(motion)
+            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+            for at, course in zip(domain.normalised(grid), domain.normalised(visited), strict=True):
+                near &= np.abs(at[:, None] - course) < visited_distance
+            trials += near.any(axis=1)
+            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+            along.setdefault(motion.trial.condition, [values[points] for values in visited])
+        parts = []
+        for condition, values in {"": grid, **along}.items():
+            force_N, sigma_N = self.force(values)
+            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan)
+            columns |= {VARIABLES[name]: at for name, at in zip(domain.variables, values, strict=True)}
+            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+            parts.append(pd.DataFrame(columns | {"condition": condition}))
+        return pd.concat(parts, ignore_index=True)
+
+    @property
+    def visited(self) -> pd.DataFrame:
+        """The points of the grid that trials visited."""
+        return self.table[(self.table["condition"] == "") & (self.table["trials"] > 0)]
+
+    @cached_property
+    def sentence(self) -> Remark:
+        """What it depends on and how certain that is."""
+        force_N = self.visited["force_N"]
+        return remark(
+            "learned_force",
+            name=self.domain.name,
+            weights=self.weights,
+            alternatives=self.not_excluded,
+            begins=self.at_start if self.domain.start_axis >= 0 else "",
+            range_N=(float(force_N.min()), float(force_N.max())),
+            sigma_N=float(self.visited["sigma_N"].median()),
+            undecided_N=self.undecided_N,
+            explained=self.explained,
+            is_repeated=self.is_repeated,
+            has_pressures=any("pressure" in name for name in self.weights),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As `diagnosis.json` holds it."""
+        return {
+            "variables": list(self.domain.variables),
+            "weights": dict(self.weights),
+            "not_excluded": list(self.not_excluded),
+            "length_scales": dict(zip(self.domain.variables, self.length_scales, strict=True)),
+            "amplitude_N": self.found.amplitude,
+            "log_bayes_factor": self.log_bayes_factor,
+            "explained": self.explained,
+            "begins": self.at_start,
+            "undecided_N": self.undecided_N,
+            "sentence": str(self.sentence),
+        }
+
+
+def learned_force(problem: ForceProblem, on_tracks: Sequence[Choice], choices: Sequence[Choice]) -> LearnedForce | None:
+    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit; choices as
+    seen from the tracks, and from the motions under the best of these.
+    """
+    misfit = on_tracks[0].equations.chi2 - problem.n_points
+    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in on_tracks}
+    # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
+    if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
+        return None
+    inflation = problem.inflation(_least_chi2(choices))
+    unit = max(LEAST_DIFFERENCE * _least_chi2(choices) / inflation, 1.0)
+    weights = variable_weights({choice.domain.name: choice.found.log_evidence for choice in choices}, unit)
+    best = max(choices, key=lambda choice: weights[choice.domain.name])
+    domain, equations, mean = best.domain, best.equations, best.found.mean
+    explained = (misfit + problem.n_points - equations.chi2_with(mean)) / misfit
+    # 0.95: part of the misfit that the force must take away to be reported (chosen)
+    if explained < 0.95:
+        return None
+    # Besides the best, those with enough weight, and those of no more variables whose χ² is hardly larger, without
+    # regard to how smooth they are. 0.05: weight from which a choice is reported with the best (chosen)
+    threshold = best.least_chi2 + inflation * unit * ANSWER_SET_DELTA_CHI2
+    others = [
+        other.domain.name
+        for other in choices
+        if other is not best
+        and (
+            weights[other.domain.name] >= 0.05
+            or (len(other.domain.variables) <= len(domain.variables) and other.least_chi2 < threshold)
+        )
+    ]
+    others.sort(key=lambda name: -weights[name])
+    at_start, lengths = domain.hypotheses[best.found.hypothesis]
+    return LearnedForce(
+        domain=domain,
+        found=best.found,
+        at_start=at_start,
+        length_scales=lengths,
+        motions=equations.point.motions,
+        weights=weights,
+        not_excluded=tuple(others),
+        log_bayes_factor=log_bayes_factors[domain.name],
+        explained=min(explained, 1.0),
+        undecided_N=_undecided_N(best, inflation),
+        is_repeated=bool(problem.scatter.dof),
+    )
+
+
+def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
+    """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
+    less: far from the solution, two are often the more likely for errors of the linear equations alone.
+    """
+    inflation = problem.inflation(_least_chi2(choices))
+    by_evidence = sorted(choices, key=lambda choice: -choice.found.log_evidence)
+    likely = {len(choice.domain.variables): choice for choice in reversed(by_evidence)}
+
+    def settle(choice: Choice) -> tuple[float, ForcePoint]:
+        return settled(choice.equations, lambda each: coefficients_of(choice.domain, each, inflation).mean)
+
+    return min((settle(choice) for choice in likely.values()), key=lambda found: found[0])[1]
+
+
+def _undecided_N(choice: Choice, inflation: float) -> float:
+    """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and P_y
+    compete with such a force.
+    """
+    domain = choice.domain
+    if domain.start_axis < 0 or len(domain.variables) < 2:
+        return 0.0
+    at = [np.linspace(low, high, 30) for low, high in zip(domain.low, domain.high, strict=True)]
+    at[domain.start_axis] = np.full(30, domain.low[domain.start_axis])
+    free = coefficients_of(domain, choice.equations, inflation, FREE_AT_START)
+    return float(np.median(standard_error(domain.basis(at), free.covariance)))
+
 
 # ------------------------------------------------------------------------------
 # Simple laws ranked by how well they explain the misfit of a fit.
@@ -182,103 +538,51 @@ def force_problem(fit: Fit) -> ForceProblem:
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
     problem = force_problem(fit)
-    # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
-    starts = (_misfit_under_law(problem, point) for point in (problem.tracks, problem.fitted))
-    seen = min(starts, key=lambda each: each.chi2_with_law)
-    chi2, point = seen.along.chi2, seen.along.point
-    explained = {"condition": max(seen.constants[0] - seen.constants[1], 0.0)}
-    for domain in candidate_domains(point.motions):
-        if domain.name in ("growth", "speed", "time"):
-            estimate = ForceEquations(problem, point, domain.unit_push).estimate()
-            explained[domain.name] = estimate.delta_chi2_beyond_chance
-    in_laws = [law.estimate.delta_chi2_beyond_chance for law in seen.laws]
-    explicable = max(1e-300, seen.by_condition[0] - seen.by_condition[1], *explained.values(), *in_laws)
-    laws = [replace(law, explained=part / explicable) for law, part in zip(seen.laws, in_laws, strict=True)]
-    depends_on = {name: explained[name] / explicable for name in ("growth", "speed", "time", "condition")}
-    named = laws[0].explained >= LEAST_EXPLAINED_TO_NAME and laws[0].is_detected
-    shift = laws[0].estimate.parameter_shift if named else fit.solution.state.theta - point.theta
-    curves = _curves(seen, shift, problem.inflation(chi2 - seen.by_condition[0]))
+    choices, learned = choices_seen_from(problem, problem.fitted), None
+    with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
+        on_tracks = choices_seen_from(problem, problem.tracks)
+        under_force = choices_seen_from(problem, _under_best(problem, on_tracks))
+        # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
+        choices = min(choices, under_force, key=_least_chi2)
+        learned = learned_force(problem, on_tracks, under_force)
+    point, chi2 = choices[0].equations.point, choices[0].equations.chi2
+    laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
+    smooth = {choice.domain.name: choice.best.delta_chi2_beyond_chance for choice in choices}
+    in_laws = [law.estimate.delta_chi2_beyond_chance for law in laws]
+    explicable = max(1e-300, *smooth.values(), *in_laws)
+    laws = [replace(law, explained=part / explicable) for law, part in zip(laws, in_laws, strict=True)]
+    depends_on = {name: part / explicable for name, part in smooth.items() if "+" not in name}
     beyond_noise = chi2 - problem.n_points
     # NaN where the misfit hardly exceeds the noise
     reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
+    drawn = max(choices, key=lambda choice: choice.found.log_evidence) if learned is None else learned
     return MissingForce(
-        table=_force_table(curves),
+        table=_force_table(_curves(drawn.domain, drawn.found, point.motions)),
         laws=_law_table(laws),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
         detected=tuple(law for law in laws if law.is_detected),
-        learned=_learned(problem),
+        learned=learned,
     )
 
 
-def _learned(problem: ForceProblem) -> LearnedForce | None:
-    try:
-        with np.errstate(all="raise", under="ignore"):
-            return learned_force(problem)
-    except (FloatingPointError, np.linalg.LinAlgError):
-        return None
-
-
-@dataclass(frozen=True)
-class _Misfit:
-    """What a fit leaves unexplained, seen from one set of motions: the equations of a force of the growth; the fall of
-    χ² with one, and with a constant, of its own in every condition, and their expectations; and the laws, best first.
-    """
-
-    domain: Domain
-    along: ForceEquations
-    by_condition: tuple[float, float]
-    constants: tuple[float, float]
-    laws: list[RankedLaw]
-
-    @property
-    def chi2_with_law(self) -> float:
-        """χ² that the first law leaves."""
-        return self.along.chi2 - self.laws[0].estimate.delta_chi2
-
-
-def _misfit(problem: ForceProblem, point: ForcePoint) -> _Misfit:
-    domain = candidate_domains(point.motions)[0]
-    along = ForceEquations(problem, point, domain.unit_push)
-    count = along.score.size
-    by_condition, constants = (along.gain_by_condition(shape) for shape in (np.eye(count), np.ones((count, 1))))
-    return _Misfit(domain, along, by_condition, constants, ranked_laws(problem, point, along.chi2, by_condition[0]))
-
-
-def _misfit_under_law(problem: ForceProblem, point: ForcePoint) -> _Misfit:
-    """The misfit seen from the motions under the law that is best there, where that leaves less. Tracks are smoothed
-    too much to show a force over a few millimetres in its place; the vine under a law is not.
-    """
-    seen, left = _misfit(problem, point), math.inf
-    while seen.laws[0].is_detected and seen.chi2_with_law < 0.99 * left:
-        left, equations = seen.chi2_with_law, ForceEquations(problem, seen.along.point, seen.laws[0].law.unit_force)
-        _, under_law = settled(equations, lambda each: each.coefficients + each.estimate().amplitude)
-        seen = min(seen, _misfit(problem, under_law), key=lambda each: each.chi2_with_law)
-    return seen
-
-
-def _curves(seen: _Misfit, parameter_shift: Floats, inflation: float) -> pd.DataFrame:
-    """A smooth force in every condition at given model parameters, along its first trial's motion, without the ends
-    where it is hardly determined. Columns `VARIABLES`, force, error and condition.
+def _curves(domain: Domain, found: Posterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
+    """The smooth force along the first trial's motion of every condition, without the ends where it is hardly
+    determined. Columns `VARIABLES`, force, error and condition.
     """
     import pandas as pd
 
-    motions, domain = seen.along.point.motions, seen.domain
-    information, score = seen.along.by_condition(parameter_shift)
-    priors = [root_of_covariance(score.shape[1], length) for length in LENGTH_SCALES]
-    found = posterior(information / inflation, score / inflation, priors, amplitudes_N(motions))
     curves = []
-    for condition, mean, covariance in zip(seen.along.problem.conditions, found.mean, found.covariance, strict=True):
-        motion = next(motion for motion in motions if motion.trial.condition == condition)
+    for condition, motion in {motion.trial.condition: motion for motion in reversed(motions)}.items():
         # 24: points of a curve (chosen)
         y = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
         time_s = np.interp(y, motion.lead_position_m, motion.time_s)
         values = {name: np.interp(time_s, motion.time_s, getattr(motion, name)) for name in VARIABLES.values()}
-        basis = domain.basis([y])
-        sigma_N = standard_error(basis, covariance)
-        curve = pd.DataFrame(values | {"force_N": basis @ mean, "sigma_N": sigma_N, "condition": condition})
+        basis = domain.basis([values[VARIABLES[name]] for name in domain.variables])
+        sigma_N = standard_error(basis, found.covariance)
+        curve = pd.DataFrame(values | {"force_N": basis @ found.mean, "sigma_N": sigma_N, "condition": condition})
         # 2.0: multiple of the median standard error above which a force is not drawn (chosen)
-        curves.append(curve[sigma_N < 2.0 * np.median(sigma_N)])
+        curves.append(curve[sigma_N <= 2.0 * np.median(sigma_N)])
     return pd.concat(curves, ignore_index=True)
 
 

@@ -25,7 +25,6 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
-from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, VARIABLES, Domain, LearnedForce
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -34,7 +33,15 @@ from vinetrack.diagnosis.likelihood_ratio import (
     likelihood_ratio,
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
-from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, missing_force
+from vinetrack.diagnosis.missing_force import (
+    LEAST_CHI2_PER_POINT,
+    LEAST_MISFIT_REDUCTION,
+    VARIABLES,
+    Domain,
+    LearnedForce,
+    RankedLaw,
+    missing_force,
+)
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
@@ -91,7 +98,7 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 # A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
 #
 # Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
-# coefficients of its splines, N, at even steps of each normalised variable (`learned_force.Domain`), and a function
+# coefficients of its splines, N, at even steps of each normalised variable (`missing_force.Domain`), and a function
 # that sums the four splines that are nonzero:
 #
 #     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,

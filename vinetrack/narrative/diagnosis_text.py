@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.force_laws import Law
-    from vinetrack.diagnosis.learned_force import LearnedForce
+    from vinetrack.diagnosis.missing_force import LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.inference.fit_result import Fit, Number
@@ -593,7 +593,7 @@ def like_no_law_text(law: str, explained: float, variable: str, alone: float) ->
 def _variables_text(name: str) -> str:
     """Return a choice of variables in words."""
     words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
-             "pressure": "the pressure", "condition": "the condition, not on what happens in a trial"}  # fmt: skip
+             "pressure": "the pressure"}  # fmt: skip
     return " and ".join(words[variable] for variable in name.split("+"))
 
 
@@ -635,7 +635,7 @@ def learned_force_text(
 
 def _begins_text(begins: str, undecided_N: float) -> str:
     """Return from where the force is measured, and which part of it the trials do not determine."""
-    from vinetrack.diagnosis.learned_force import CONSTANT_AT_START, FREE_AT_START
+    from vinetrack.diagnosis.missing_force import CONSTANT_AT_START, FREE_AT_START
 
     if not begins:
         return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
