@@ -31,7 +31,6 @@ from vinetrack.diagnosis.score_test import (
     CandidateShape,
     Products,
     effect_sensitivities,
-    informations_at,
     plausible_range,
     products_of,
     projected,
@@ -388,8 +387,9 @@ def error_inflation(tests: MisfitTests) -> Floats:
     pairs = np.array(list(itertools.product(*factors)))
     spreads = [(pressure, damping) for pressure, damping in (pairs * fit.state.spread).tolist()]
     penalties = scores.degrees * np.sum(2 * np.log(pairs) + 1 / pairs**2 - 1, axis=1)
-    ratio = informations_at(fit, tests.products, spreads) / np.maximum(np.diag(scores.information), 1e-300)
-    remaining = np.clip(ratio, 1e-6, 1.0)
+    states = [replace(fit.state, spread=spread) for spread in spreads]
+    information = np.array([np.diag(projected(fit, tests.products, state).information) for state in states])
+    remaining = np.clip(information / np.maximum(np.diag(scores.information), 1e-300), 1e-6, 1.0)
     costs = penalties[None, :, None] + SCORE_GRID[:, None, None] ** 2 * remaining
     best = np.argmin(costs, axis=1)
     return np.asarray(1 / np.sqrt(np.take_along_axis(remaining, best, axis=0)))

@@ -29,21 +29,17 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names
-from vinetrack.inference.gaussian_processes import all_products, at_correlation
+from vinetrack.inference.gaussian_processes import all_products
 from vinetrack.inference.marginal_likelihood import (
-    LEAST_BETWEEN_TRIAL_SD,
     FitState,
     MixedProblem,
     inverse_of_block,
-    solve_per_trial,
     sum_matrix_blocks,
     sum_vector_blocks,
     trial_effects_eliminated,
 )
-from vinetrack.inference.marginal_likelihood import trial_deviation_sd as between_trial_sd
-from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
+from vinetrack.inference.sensitivity import position_change
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
@@ -555,49 +551,6 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
     trial_scores[:, projection.empty] = 0.0
     groups = coarsest_groups([trial.trial for trial in fit.trials])
     return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)
-
-
-def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float, float]]) -> Floats:
-    """Information of every shape's size, each alone, at other between-trial standard deviations. Equal to that of
-    `scores_of`, but summed over trials first: the standard deviations only change the contribution of each trial's two
-    deviations, of rank two, so that no block of all shapes is needed for any trial. Shape (n_spreads, n_shapes).
-    """
-    state, p = fit.state, products.n_unknowns
-    # Shapes are further parameters, without a prior.
-    problem = with_shapes(products.problem, products.n_shapes, prior_precision=0.0)
-    total, index = problem.prior_mean.size, problem.places
-    whole, squares, levers = np.zeros((total, total)), [], []
-    for part in products.parts:
-        # The information does not depend on the residual.
-        cross_products = np.delete(
-            np.delete(products.cross_products(part), N_TRIAL_EFFECTS + p, axis=2), N_TRIAL_EFFECTS + p, axis=3
-        )
-        white = at_correlation(cross_products, state.rho) / state.variance[part, None, None]
-        release_origin = white[:, :2, :2] + problem.release_origin_precision[part, :, None] * np.eye(2)
-        eliminated = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(release_origin, white[:, :2, 2:])
-        whole += sum_matrix_blocks(eliminated[:, 2:, 2:], problem.of_trials(part))
-        lever = np.zeros((len(eliminated), 2, total + 1))
-        for k in range(index.shape[1]):
-            lever[np.arange(len(eliminated)), :, index[part, k]] += eliminated[:, :2, 2 + k]
-        squares.append(eliminated[:, :2, :2])
-        levers.append(lever[:, :, :total])
-    square, lever = np.concatenate(squares), np.concatenate(levers)
-    unknowns, shapes = slice(0, total - products.n_shapes), slice(total - products.n_shapes, None)
-    diagonals = []
-    for spread in spreads:
-        precision = 1 / np.maximum(between_trial_sd(problem, spread), LEAST_BETWEEN_TRIAL_SD) ** 2
-        explained = solve_per_trial(square + precision[:, :, None] * np.eye(2), lever)
-        information = (
-            whole - lever.reshape(-1, total).T @ explained.reshape(-1, total) + np.diag(problem.prior_precision)
-        )
-        hessian, cross, alone = (
-            information[unknowns, unknowns],
-            information[unknowns, shapes],
-            information[shapes, shapes],
-        )
-        inverse = inverse_of_block(hessian, _adapting(fit, products.problem, hessian))
-        diagonals.append(np.diag(_without_rounding(alone - cross.T @ inverse @ cross, alone)[0]))
-    return np.array(diagonals)
 
 
 def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bool_]]:
