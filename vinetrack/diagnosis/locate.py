@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.force_inversion import FittedMotion, acceleration_sensitivities, motions_of
 from vinetrack.diagnosis.ladder import excess, position_errors
 from vinetrack.diagnosis.replicates import (
-    LEAST_BETWEEN_TRIAL_SD,
     AlignedTrials,
     Replicates,
     ResidualCourse,
@@ -38,11 +36,9 @@ from vinetrack.diagnosis.replicates import (
     residual_courses,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
-from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
-from vinetrack.inference.fit import fit_subset
-from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, Number
 from vinetrack.inference.robust_covariance import robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
@@ -99,7 +95,7 @@ def locate(fit: Fit) -> Failure:
         along_position=_table("lead_position_m", "m", _parts("lead_position_m", courses), scatter),
         along_speed=_table("lead_velocity_m_s", "m_s", _parts("lead_velocity_m_s", courses), scatter),
         scatter=scatter,
-        drift=drift(fit, scatter),
+        drift=drift(fit),
     )
 
 
@@ -191,15 +187,7 @@ def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
     yield remark("fails_most", condition=_named(worst, table), **numbers)
     # 2.0: significance, in standard deviations, from which it is said to fail in a condition
     count, total = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum()), len(table)
-    yield remark("fails_everywhere") if count == total else remark("fails_in", count=count, total=total)
-    for column in ("pressure_Pa", "payload_kg"):
-        usable = table[np.isfinite(table["ratio"])]
-        steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]
-        steps = [step for step in steps if step.size > 2]
-        if steps and len(set(usable[column])) >= 3:
-            ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
-            if min(ranks) > 0.75 or max(ranks) < -0.75:
-                yield remark("misfit_follows", column=column, rises=bool(ranks[0] > 0))
+    yield remark("fails_in", count=count, total=total)
 
 
 def _named(row: pd.Series, table: pd.DataFrame) -> dict[str, object]:
@@ -245,7 +233,6 @@ class Drift:
 
     table: pd.DataFrame
     groups: pd.DataFrame
-    notes: tuple[Remark, ...] = ()
 
     @property
     def remarks(self) -> tuple[Remark, ...]:
@@ -254,20 +241,17 @@ class Drift:
         return tuple(significant["sentence"])
 
 
-def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
-    """Test every parameter for drift with pressure, payload, angle, chamber, inlet, vine or along the growth."""
+def drift(fit: Fit) -> Drift:
+    """Test every parameter for drift with pressure, payload, angle, chamber, inlet or along the growth."""
     import pandas as pd
 
-    notes: list[Remark] = []
-    scatter = scatter or replicate_scatter(fit, residual_courses(fit)[0])
-    tests = sorted(_tests(fit, scatter, notes), key=lambda tested: tested.p)
+    tests = sorted(_tests(fit), key=lambda tested: tested.p)
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]
     return Drift(
         pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool, "relative": bool}),
         pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
-        tuple(notes),
     )
 
 
@@ -293,7 +277,7 @@ class ConstancyTest:
     groups: Sequence[dict[str, object]]
 
 
-def _tests(fit: Fit, scatter: Scatter, notes: list[Remark]) -> Iterator[ConstancyTest]:
+def _tests(fit: Fit) -> Iterator[ConstancyTest]:
     aligned = align_trials(fit)
     for key in fit.predictor.layout.keys:
         if key in (YIELD_PRESSURE, EXPONENT):
@@ -301,16 +285,11 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[Remark]) -> Iterator[Constanc
         try:
             estimates = per_trial_estimates(fit, key, aligned)
         except SimulationError:
-            notes.append(remark("not_fitted_to_trials", key=key))
-            continue
+            continue  # No trial can be simulated with another value
         for against in COVARIATES:
             yield from _against(estimates, against)
         if key == DAMPING:
-            try:
-                yield from _along_growth(fit, estimates)
-            except SimulationError:
-                notes.append(remark("not_fitted_along_growth"))
-    yield from _between_vines(fit, scatter)
+            yield from _along_growth(fit, estimates)
     yield from against_the_sheet(fit)
 
 
@@ -589,75 +568,20 @@ def _along_growth(fit: Fit, estimates: PerTrialEstimates) -> Iterator[ConstancyT
 
 def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
     """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2), linearised about each
-    trial's own B. About the common B, the between-trial scatter would enter in second order.
+    trial's own B. About the common B, the between-trial scatter would enter in second order. What B does in the first
+    half is carried through the second as a shift in time, as where inertia is small.
     """
-    motions = motions_of(fit, estimates.trial_effects)
-    pushes = list(map(_pushes, motions, fit.predictor.data, estimates.trial_effects[:, RELEASE]))
-    halves = np.full((len(motions), 2), math.nan)
-    responses = acceleration_sensitivities(fit, estimates.trial_effects, motions, pushes)
-    for i, (response, columns) in enumerate(zip(responses, estimates.columns, strict=True)):
-        if np.all(np.ptp(response, axis=0) > 0):
-            design = np.column_stack([response, columns[:, estimates.nuisances[i]]])
-            halves[i] = np.linalg.lstsq(design, columns[:, -1], rcond=1e-9)[0][:2]
+    halves = np.full((len(estimates.trials), 2), math.nan)
+    for i, (trial_data, columns) in enumerate(zip(fit.predictor.data, estimates.columns, strict=True)):
+        response, speed, residual = columns[:, N_TRIAL_EFFECTS], -columns[:, RELEASE], columns[:, -1]
+        growth = trial_data.lead_position_m - residual - estimates.trial_effects[i, ORIGIN]
+        middle = int(np.argmax(growth >= 0.5 * growth.max()))
+        if speed[middle] > 0 and response[middle] != 0:
+            first = response.copy()
+            first[middle:] = response[middle] * speed[middle:] / speed[middle]
+            design = np.column_stack([first, response - first, columns[:, estimates.nuisances[i]]])
+            halves[i] = np.linalg.lstsq(design, residual, rcond=1e-9)[0][:2]
     return halves + estimates.trial_effects[:, [DAMPING_DEVIATION]]
-
-
-def _pushes(motion: FittedMotion, trial_data: FitTrial, release_s: float) -> Floats:
-    """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
-    step = 1e-3  # Relative step of a finite difference (derived)
-    y, v, value = motion.lead_position_m, motion.lead_velocity_m_s, motion.model.values[DAMPING]
-    assert isinstance(value, float)
-    increased = motion.model.with_values({DAMPING: value * math.exp(step)})
-    changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
-    push = ((changed - motion.model_acceleration) / step)[:, None]
-    first = (y < 0.5 * np.interp(trial_data.time_s - release_s, motion.time_s, y).max())[:, None]
-    return np.where(np.hstack([first, ~first]), push, 0.0)
-
-
-# ------------------------------------------------------------------------------
-# Parameters shared by all trials between vines, and the fitted yield pressure against the sheet.
-
-MOST_ITERATIONS = 15  # Maximum number of iterations of a refit (chosen)
-
-
-def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
-    """χ² test of parameters shared by all trials: each vine with several pressures is fitted alone, its between-trial
-    scatter that of replicates. The change is from the lowest to the highest value.
-    """
-    from scipy.stats import chi2 as chi_square
-
-    shared = [number for number in fit.numbers if not number.vine and number.key != YIELD_PRESSURE]
-    spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
-    state = replace(fit.solution.state, spread=spread)
-    rescaled = replace(fit, solution=replace(fit.solution, state=state))
-    alone: dict[str, Fit] = {}
-    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials) if shared else ():
-        members = [trial for trial in fit.trials if trial.trial.vine == vine]
-        if len({trial.trial.pressure_Pa for trial in members}) < 2:
-            continue
-        names = [trial.name for trial in members]
-        try:
-            alone[vine] = fit_subset(
-                rescaled, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
-            )
-        except FitError:
-            continue
-    for common in shared:
-        values = {vine: part[common.key] for vine, part in alone.items() if 0 < part[common.key].sigma < math.inf}
-        if len(values) < 2:
-            continue
-        precision = np.array([1 / number.sigma**2 for number in values.values()])
-        apart = _centred(np.array([number.value for number in values.values()]), precision, np.full(len(values), ""))
-        low, *_, high = sorted(values.items(), key=lambda of_vine: of_vine[1].value)
-        change = high[1].value - low[1].value, math.hypot(high[1].sigma, low[1].sigma)
-        p = float(chi_square.sf(float(np.sum(precision * apart**2)), len(values) - 1))
-        counts = {vine: len(alone[vine].trials) for vine in values}
-        groups = [
-            _group(each, vine, "vine", math.nan, common.value, (each.value - common.value, each.sigma), counts[vine])
-            for vine, each in values.items()
-        ]
-        n_trials, levels = sum(counts.values()), (math.nan, math.nan)
-        yield _tested(common, "", "vine", levels, change, (p,), math.inf, n_trials, groups, ends=[low, high])
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:

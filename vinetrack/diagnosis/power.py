@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from vinetrack.core.problems import Remark, in_words, remark
+from vinetrack.core.problems import Remark, in_words
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import plot
 from vinetrack.inference.fit_result import OrNaN, or_open
@@ -239,7 +239,6 @@ class Power(JsonRecord):
             "not_testable": {name: str(why) for name, why in self.not_testable.items()},
             "wary": str(self.wary),
             "simulated": [rates.to_json() for rates in self.simulated],
-            "in_words": str(remark("detectable", power=self)).splitlines(),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
 

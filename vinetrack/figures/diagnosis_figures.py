@@ -215,8 +215,8 @@ def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
     return fig
 
 
-# Colour, line and offset of the models in the figure of drifts
-_MODELS = {"before": (BEFORE, st.DASHED, -0.06), "after": (AFTER, "-", 0.06)}
+# Colour and line of the models in the figure of drifts
+_MODELS = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
 
 
 @figure("drift", "drift", "Parameters that change with a condition", data="drift")
@@ -238,28 +238,22 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
     for ax, (parameter, against) in zip(st.panel_grid(fig, len(panels), n_columns), panels, strict=True):
         groups = known[(known["parameter"] == parameter) & (known["against"] == against)]
         name, unit, factor = drift_condition(str(against))
-        names, by_vine = list(dict.fromkeys(groups["vine"])), against == "vine"
-        for model, (colour, line, offset) in _MODELS.items():
+        for model, (colour, line) in _MODELS.items():
             of_model = groups[groups["model"] == model]
-            for vine, of_vine in [("", of_model)] if by_vine else of_model.groupby("vine", sort=False):
+            for vine, of_vine in of_model.groupby("vine", sort=False):
                 ordered = of_vine.sort_values("level")
-                places = [names.index(one) + offset for one in ordered["vine"]]
-                x = places if by_vine else st.column(ordered, "level", factor)
                 style: dict[str, Any] = {"color": colour, "marker": markers[str(vine)], "ms": 5, "elinewidth": 1.0}
-                style |= {"lw": 1.1, "ls": "none" if by_vine else line}
-                ax.errorbar(x, ordered["ratio"], ordered["ratio_sigma"], **style)
+                style |= {"lw": 1.1, "ls": line}
+                ax.errorbar(st.column(ordered, "level", factor), ordered["ratio"], ordered["ratio_sigma"], **style)
         ax.axhline(1, color=st.INK, lw=0.8)
         count = int(groups.loc[groups["model"] == groups["model"].iloc[0], "n_trials"].sum())
         st.small_title(ax, f"{groups['symbol'].iloc[0]} against {name}, N = {count}", fontsize=9.5)
         ax.set_xlabel(f"{name} ({unit})" if unit else name, fontsize=10)
-        if by_vine:
-            ax.set_xticks(range(len(names)), names, fontsize=8)
-            ax.margins(x=0.25)
         ax.locator_params(axis="y", nbins=5)
     fig.supylabel("value / common law", fontsize=11)
     handles = [
         st.line_key(f"{model}: with {added}" if model == "after" and added else model, color=colour, marker="o", ms=5)
-        for model, (colour, _, _) in _MODELS.items()
+        for model, (colour, _) in _MODELS.items()
         if (known["model"] == model).any()
     ]
     handles += [st.line_key(vine, color=st.MUTED, marker=markers[vine], ls="none") for vine in vines]

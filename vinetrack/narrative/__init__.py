@@ -27,10 +27,7 @@ SENTENCES = {
     "not_located": "Where the model fails could not be computed: {error}",
     "no_missing_force": "The missing force could not be computed: {error}",
     "fails_in": "It fails in {count} of {total} conditions by more than the scatter of replicates.",
-    "fails_everywhere": "It fails in every condition by more than the scatter of replicates.",
     "undetermined_vine": "no other condition of the vine {vine} determines its parameters",
-    "not_fitted_to_trials": "{key} could not be fitted to single trials: the simulation fails there.",
-    "not_fitted_along_growth": "B along the growth could not be estimated: the simulation fails there.",
     "no_smooth_force": "No smooth force on the tail explains the misfit: a separate one in every condition takes away "
     "{reduction:.0%} of it. Either it is no force, or the model is too far off to say.",
     "no_law_agreed_on": "What is missing is no simple law of force that single trials agree on.",

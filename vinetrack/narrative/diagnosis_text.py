@@ -24,7 +24,6 @@ from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
     expected_text,
-    listed_names,
     odd_deciding_in_words,
     odd_in_words,
     spaced_name,
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.missing_force import LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
-    from vinetrack.inference.fit_result import Fit, Number
+    from vinetrack.inference.fit_result import Fit
     from vinetrack.planning.prediction import Contribution
 
 
@@ -82,28 +81,6 @@ def detectable_count(power: Power) -> str:
     """Return how many effects the trials detect with 90 % power at their largest plausible size."""
     n_detectable = sum(_at_largest(entry) >= 0.9 for entry in power.effects)
     return f"{n_detectable} of {len(power.effects) + len(power.not_testable)} effects"
-
-
-def could_have_seen(power: Power) -> list[str]:
-    """Return the sizes that the trials detect with 90 % power, and the effects that they do not detect."""
-    if power.wary:
-        return [f"Detectable sizes were not computed: {power.wary}."]
-    physical, lines = _physical(power), []
-    if sizes := [
-        f"{spaced_name(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
-        for entry in physical
-        if _at_largest(entry) >= 0.9
-    ]:
-        lines.append(f"Detectable with 90 % power: {'; '.join(sizes)}.")
-    if parts := [
-        f"{spaced_name(one.effect)} ({percent(_at_largest(one))} at {one.symbol} = {size_text(one, one.largest)})"
-        for one in physical
-        if LOW_POWER <= _at_largest(one) < 0.9
-    ]:
-        lines.append(f"Detectable with less power, even at the largest plausible size: {joined(parts)}.")
-    if undetectable := unseen(power):
-        lines.append(f"Not detectable: {listed_names(undetectable)}.")
-    return lines
 
 
 def unseen(power: Power) -> list[str]:
@@ -407,14 +384,10 @@ def gain_in_words(before: Fit, after: Fit) -> str:
     """Return the improvement by an added effect. The model with the effect contains the one without it, so a loss shows
     that the optimiser has not converged.
     """
-    clear_gain = 9.0  # Δχ² above which an added effect is said to help (derived)
     gain = 2 * (after.log_likelihood - before.log_likelihood)
-    if gain < 0:
-        return "the fit did not converge, so whether it helps is unknown"
-    helps = f"Δχ² = {gain:.1f}"
-    if gain <= clear_gain:
-        helps = f"no significant improvement ({helps}; {clear_gain:g} are needed)"
-    return helps if after.converged else f"{helps}; the fit did not converge"
+    # 9.0: Δχ² above which an added effect is said to help (derived)
+    helps = f"Δχ² = {gain:.1f}{'' if gain > 9.0 else ', no significant improvement'}"
+    return helps if after.converged and gain >= 0 else f"{helps}; the fit did not converge"
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
@@ -539,15 +512,8 @@ def drift_condition(column: str) -> tuple[str, str, float]:
     return column.replace("_", " "), "", 1.0
 
 
-def drift_text(
-    row: Mapping[str, Any],
-    steady: bool = True,
-    stated_sigma_Pa: float = math.nan,
-    ends: Sequence[tuple[str, Number]] = (),
-) -> str:
-    """Return how a parameter drifts: a row of the table of drifts, whether it rises steadily, the error of the sheet,
-    and the lowest and highest value among vines.
-    """
+def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: float = math.nan) -> str:
+    """Return how a parameter drifts: a row of the table, whether it rises steadily, the error of the sheet."""
     against, z, start, stop = (row[name] for name in ("against", "z", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
     unit, factor = ("%", 100.0) if row["relative"] else display_unit(row["unit"])
@@ -556,11 +522,6 @@ def drift_text(
             f"{who} is pulled from the {start / 1e3:.2f} ± {stated_sigma_Pa / 1e3:.2f} kPa of the sheet to"
             f" {stop / 1e3:.2f} kPa ({z:.1f} σ)."
         )
-    if against == "vine":
-        values = [
-            f"{one.value * factor:.3g} ± {one.sigma * factor:.1g} {unit}".rstrip() + f" ({vine})" for vine, one in ends
-        ]
-        return f"{who} differs between the vines ({z:.1f} σ), though one value should describe all: {joined(values)}."
     change, error = factor * row["change"], factor * row["change_sigma"]
     digits = max(decimals(error) - 1, 0)
     amount = f"{change:.{digits}f} ± {error:.{digits}f} {unit}".rstrip()
@@ -859,7 +820,6 @@ REMARKS: dict[str, Callable[..., str]] = {
     "no_feasible_trial": lambda measurement: f"No trial within the limits can be made and simulated. {measurement}",
     "trials_to_make": advice_text,
     "no_trials_separate": partial(advice_text, worth_it=False),
-    "detectable": lambda power: "\n".join([false_alarm_sentence(power), *could_have_seen(power)]),
     "diagnosis_page": diagnosis_page,
     "law": law_text,
     "fails_nowhere": lambda z, condition: (
@@ -867,10 +827,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         f" (at most {z:.1f} σ, at {_condition_text(**condition)})."
     ),
     "fails_most": fails_most_text,
-    "misfit_follows": lambda column, rises: (
-        f"The {('lower', 'higher')[rises] if column == 'pressure_Pa' else ('smaller', 'larger')[rises]} the"
-        f" {'pressure' if column == 'pressure_Pa' else 'payload'}, the larger the misfit."
-    ),
     "drifts": drift_text,
     "like_no_law": like_no_law_text,
     "like_a_law": lambda law, explained, others: (

@@ -31,14 +31,13 @@ from vinetrack.diagnosis.result import (
 from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue, remedy
-from vinetrack.experiment.folder import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
+from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.inference.robust_covariance import FILM_ERROR
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.core.problems import Remark
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
@@ -86,14 +85,8 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
     if not names:
         return ""
     text = "".join(f" {BETWEEN[name].remedy}." for name in names)
-    if ORDER_DRIFT not in names and SPECIMEN not in names:
-        return text
-    _, stated = trial_order(trials)
-    if not stated:
+    if (ORDER_DRIFT in names or SPECIMEN in names) and not trial_order(trials)[1]:
         text = f" The trials were assumed to be in the order of the rows.{text}"
-    correlation = order_pressure_correlation(trials)
-    if math.isfinite(correlation) and abs(correlation) >= CONFOUNDING_CORRELATION:
-        text = f" Trials were made in the order of pressure (rank correlation {correlation:.2f}).{text}"
     return text
 
 
@@ -471,8 +464,9 @@ def explain(step: SelectionStep) -> str:
         by_film=_by_film(answers),
     )
     if step.note:
-        text += f" {_capital(step.note)} ({' and '.join(best.names)} together do)."
-    text += f"{_chamber(answers)}{_slips(answers)}{remedies_in_words(step)}"
+        note = str(step.note)
+        text += f" {note[0].upper()}{note[1:]} ({' and '.join(best.names)} together do)."
+    text += f"{_slips(answers)}{remedies_in_words(step)}"
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
     if verdict == ARTEFACT and (others := best.names[1:]):
@@ -500,23 +494,6 @@ def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
         f"to {last.fit.chi2_per_dof:.1f}, with {sizes_in_words(last.numbers)}. A significant misfit remains, so none of"
         " them is shown to be missing."
     )
-
-
-def _chamber(answers: Sequence[LikelihoodRatio]) -> str:
-    """Bound the volume of the chamber where the fitted γ is not one of air; blank where it is."""
-    exponents = {f"{effect.name}.{p.name}": p for hypothesis in answers for effect in hypothesis.effects
-                 for p in effect.parameters if "chamber_l" in effect.needs and p.symbol == "γ"}  # fmt: skip
-    for entry in (entry for hypothesis in answers for entry in hypothesis.numbers if entry.key in exponents):
-        low, high = exponents[entry.key].plausible or (-math.inf, math.inf)
-        if not is_finite(entry.sigma) or low - 2 * entry.sigma <= entry.value <= high + 2 * entry.sigma:
-            continue
-        larger = entry.value < low
-        how, times, hint = ("least", low, "; count the hoses too") if larger else ("most", high, "")
-        return (
-            f" Air has a γ of {low:g} to {high:g}, not {entry.value:.2f}: the volume of the chamber is at {how}"
-            f" {times / entry.value:.2f} times the stated chamber_l{hint}."
-        )
-    return ""
 
 
 def _slips(answers: Sequence[LikelihoodRatio]) -> str:
@@ -582,18 +559,7 @@ def _hypotheses(answers: Sequence[LikelihoodRatio]) -> str:
 
 
 def _adequate(step: SelectionStep, model: str, trials: str) -> str:
-    tests = step.tests
-    if step.note:
-        return f"{model} explains {trials} within the errors of position. {_capital(step.note)}."
     text = f"{model} explains {trials}: no missing effect can be detected."
-    if tests.one_sided_z.size:
-        names = tests.sensitivities.effects
-        thresholds = [tests.family.threshold(name) for name in names]
-        best = int((tests.one_sided_z - thresholds).argmax())
-        text += (
-            f" Nearest to its threshold is {names[best]}, {tests.one_sided_z[best]:.1f} of {thresholds[best]:.1f} σ;"
-            f" chance takes a candidate to it in one of {1 / tests.level:.0f} campaigns."
-        )
     if not step.unstated_differences:
         return text
     unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)
@@ -601,11 +567,6 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         f"{text} However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(unstated)}"
         f" (Δχ² = {unstated.delta_chi2:.0f}).{remedies_in_words(step, [unstated])}"
     )
-
-
-def _capital(note: Remark) -> str:
-    text = str(note)
-    return f"{text[0].upper()}{text[1:]}"
 
 
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:

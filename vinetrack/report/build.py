@@ -33,7 +33,6 @@ from vinetrack.narrative.diagnosis_text import (
     LAW_METHODS,
     POWER_COLUMNS,
     PREFERRED,
-    could_have_seen,
     damping_headline,
     false_alarm_sentence,
     power_rows,
@@ -171,7 +170,7 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
         rounds.append({"ranking": ranking_rows(entry), "blind": blind, "of": entry})
     sizes, power = [], diagnosis.power
-    wary = could_have_seen(power) if power is not None and power.wary else []
+    wary = [f"Detectable sizes were not computed: {power.wary}."] if power is not None and power.wary else []
     if power is not None and not power.wary:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     return {
