@@ -28,8 +28,8 @@ def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> Like
 def sets_of(known: list[LikelihoodRatio], thresholds=None) -> EffectSets:
     family = score_test.FamilyTest(3.9, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
-    search = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
-    return EffectSets(search, known, lambda _line: None)
+    search = SimpleNamespace(tests=tests, tests_after=lambda _fit: after, report=lambda _line: None)
+    return EffectSets(search, known)
 
 
 def pairs(worth: float) -> list[LikelihoodRatio]:
@@ -184,7 +184,7 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
     monkeypatch.setattr(selection, "_shared_step", lambda verdict, *parts: (verdict, parts[4]))
     monkeypatch.setattr(selection, "_remainder", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))
     monkeypatch.setattr(selection, "SelectionStep", lambda *_, **__: None)
-    steps = selection._rounds_of_sets(sets, sets, [pair], {}, sets)  # type: ignore[list-item]
+    steps = selection._rounds(sets, sets, [pair], {}, sets)  # type: ignore[list-item]
     assert [step for step in steps if step is not None] == named
 
 

@@ -14,7 +14,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -42,7 +42,7 @@ from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import with_smooth_errors
 
@@ -240,25 +240,6 @@ MIN_LINEAR_GAIN = 2.0  # Predicted fall of −2 ln L below which a difference is
 SYSTEMATICS_CHECK_P_VALUE = 0.01
 
 
-@dataclass(frozen=True)
-class BetweenRatio(LikelihoodRatio):
-    """The likelihood ratio of a difference between trials."""
-
-    difference: Difference = field(default_factory=lambda: Difference(""))
-
-    @property
-    def numbers(self) -> tuple[Number, ...]:
-        """Its coefficients, or the exponents of the vines."""
-        keys = {term.key for term in self.difference.terms} | set(self.difference.shared)
-        return tuple(number for number in self.fit.numbers if number.key in keys and math.isfinite(number.sigma))
-
-    @property
-    def others(self) -> tuple[Number, ...]:
-        """All other parameters of its fit."""
-        keys = {number.name for number in self.numbers}
-        return tuple(number for number in self.fit.numbers if number.name not in keys)
-
-
 def differences(fit: Fit) -> list[Difference]:
     """Hypotheses that trials differ, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
@@ -298,20 +279,12 @@ def between_fits(
             continue
         # Exponents of several vines are as many sizes, less the one they had; random effects are integrated out.
         sizes = max(len(fit.numbers) - len(before.numbers), 1) if difference.shared else 1
-        ratio = likelihood_ratio(
-            before, (_effect_of(difference),), fit, widened_by=_widened_by(difference), sizes=sizes
-        )
-        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference}))
+        # The robust error of a random effect's coefficient, from the few trials of its group, is meaningless.
+        random = any(math.isfinite(term.prior_sd) for term in difference.terms)
+        widened_by = () if random else (difference.name, *difference.shared)
+        ratio = likelihood_ratio(before, (_effect_of(difference),), fit, widened_by=widened_by, sizes=sizes)
+        fitted.append(replace(ratio, split=tuple(difference.shared)))
     return fitted
-
-
-def _widened_by(difference: Difference) -> tuple[str, ...]:
-    """Names of the sizes whose scatter between trials reduces the significance of a difference. Those of its
-    parameters; but the coefficient of a random effect depends on the few trials of its group only, and its robust
-    standard error is meaningless.
-    """
-    random = any(math.isfinite(term.prior_sd) for term in difference.terms)
-    return () if random else (difference.name, *difference.shared)
 
 
 def _effect_of(difference: Difference) -> Effect:

@@ -16,9 +16,7 @@ import numpy as np
 from vinetrack.diagnosis.likelihood_ratio import (
     OUT_OF_REACH,
     LikelihoodRatio,
-    NestedForm,
     likelihood_ratio,
-    simpler_forms,
 )
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
@@ -154,7 +152,6 @@ class CandidateFits:
     report: Report
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    nested_tried: set[NestedForm] = field(default_factory=set)
     tests_by_fit: list[tuple[Fit, bool, MisfitTests]] = field(default_factory=list)
 
     @property
@@ -181,23 +178,7 @@ class CandidateFits:
         for name in self.names if all_of_them else self._promising[:most]:
             if name not in self.fitted and name not in self.failed:
                 self._fit_from_prediction(name)
-        self._fit_simpler_forms()
         return list(self.fitted.values())
-
-    def _fit_simpler_forms(self) -> None:
-        """Fit the simpler forms of effects that contain one, from where the larger form ended. A larger form that is
-        out of the running is skipped: the simpler form is nested in it and fits no better.
-        """
-        before = self.tests.fit
-        best = max((hypothesis.fit.log_likelihood for hypothesis in self.fitted.values()), default=0.0)
-        for hypothesis in list(self.fitted.values()):
-            if 2 * (best - hypothesis.fit.log_likelihood) > OUT_OF_REACH:
-                continue
-            for effects, fit in simpler_forms(before, hypothesis, self.tests.effects, self.nested_tried):
-                simpler = likelihood_ratio(before, effects, fit)
-                known = self.fitted.get(simpler.label)
-                if known is None or simpler.delta_chi2 > max(known.delta_chi2, FAILED_FIT_DELTA_CHI2):
-                    self.fitted[simpler.label] = simpler
 
     @property
     def _promising(self) -> list[str]:

@@ -5,12 +5,12 @@ diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
-from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio, weights_of
+from vinetrack.diagnosis.ladder import ladder as error_ladder
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.replicates import (
@@ -54,8 +55,6 @@ from vinetrack.tracks.position_noise import rejected_points_note
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import Limits
-
-log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
 
@@ -110,7 +109,8 @@ def diagnose(
     if outliers_note:
         result = replace(result, notes=(*result.notes, outliers_note))
     if ladder:
-        result = _with_ladder(result, report)
+        report("errors before and after")
+        result = _or_note(result, "no_ladder", partial(_with_ladder, result))
     if ladder and result.final_verdict == ADEQUATE:
         report("looking for contradictions")
         result = replace(result, notes=(*result.notes, *contradictions(result.fits, result.effects, result.ladder)))
@@ -183,15 +183,18 @@ def _sets(step: SelectionStep) -> tuple[tuple[str, ...], ...]:
     return sets if any(len(names) > 1 for names in sets) else ()
 
 
+def _refitted(hypothesis: LikelihoodRatio, effect: Effect, **more: Any) -> Candidate:
+    """The row of a fitted hypothesis, named after one of its effects."""
+    known = (hypothesis.delta_chi2, hypothesis.sigma, hypothesis.numbers, hypothesis.plausible)
+    return Candidate(effect.name, effect.kind, REFITTED, *known, **more)
+
+
 def _partial_candidates(step: SelectionStep) -> tuple[Candidate, ...]:
     """The partial steps, each compared with the one before it."""
     candidates, before = [], step.tests.fit
     for hypothesis in step.partial:
         effect = hypothesis.effects[-1]
-        ratio = likelihood_ratio(before, (effect,), hypothesis.fit)
-        candidates.append(
-            Candidate(effect.name, effect.kind, REFITTED, ratio.delta_chi2, ratio.sigma, ratio.numbers, ratio.plausible)
-        )
+        candidates.append(_refitted(likelihood_ratio(before, (effect,), hypothesis.fit), effect))
         before = hypothesis.fit
     return tuple(candidates)
 
@@ -205,75 +208,48 @@ def _cosines(tests: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
 
 
 def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Candidate]:
-    tests = step.tests
-    rejected = dict(step.rejected)
+    """All candidates: the answer set, then those fitted (also differences between trials, and a tail that goes slack),
+    those screened, and those that cannot be tested.
+    """
+    tests, rejected = step.tests, dict(step.rejected)
     singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
     weights = weights_of(list(singles.values()))
+    effects = {effect.name: effect for effect in tests.effects}
     rows = []
-    for effect in tests.effects:
+    for name, single in singles.items():
+        in_answer_set = name in step.answer_names
+        row = _refitted(
+            single,
+            single.effects[0],
+            in_answer_set=in_answer_set,
+            reason=rejected.get(name, single.reason),
+            largest=tests.upper_limits(effects[name])[0] if name in effects else {},
+            along=single.others if in_answer_set else (),
+            posterior_weight=weights[name],
+            confounded_by=tuple(each for each in step.confounded if each.number.key.split(".")[0] == name),
+            log_bayes=single.log_bayes,
+        )
+        rows.append(row)
+    for effect in (effect for name, effect in effects.items() if name not in singles):
         upper_limits, is_detectable = tests.upper_limits(effect)
+        z, shape = tests.best_z(effect.name)
         if effect.name in tests.sensitivities.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
-            continue
-        z, shape = tests.best_z(effect.name)
-        in_answer_set = effect.name in step.answer_names
-        if effect.name in singles:
-            single = singles[effect.name]
-            rows.append(
-                Candidate(
-                    effect.name,
-                    effect.kind,
-                    REFITTED,
-                    single.delta_chi2,
-                    single.sigma,
-                    single.numbers,
-                    single.plausible,
-                    in_answer_set,
-                    reason=rejected.get(effect.name, single.reason),
-                    largest=upper_limits,
-                    along=single.others if in_answer_set else (),
-                    posterior_weight=weights[effect.name],
-                    confounded_by=tuple(
-                        confounder
-                        for confounder in step.confounded
-                        if confounder.number.key.split(".")[0] == effect.name
-                    ),
-                    log_bayes=single.log_bayes,
-                )
-            )
         elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
         else:
-            rows.append(
-                Candidate(
-                    effect.name,
-                    effect.kind,
-                    SCREENED,
-                    _predicted_gain(step, effect.name, z),
-                    z,
-                    tests.predicted_size(effect, shape),
-                    in_answer_set=in_answer_set,
-                    reason=_contains_answer(effect, step),
-                    largest={} if tests.poorly_fitted else upper_limits,
-                )
+            row = Candidate(
+                effect.name,
+                effect.kind,
+                SCREENED,
+                _predicted_gain(step, effect.name, z),
+                z,
+                tests.predicted_size(effect, shape),
+                in_answer_set=effect.name in step.answer_names,
+                reason=_contains_answer(effect, step),
+                largest={} if tests.poorly_fitted else upper_limits,
             )
-    # Differences between trials, and a tail that goes slack
-    rows += [
-        Candidate(
-            name,
-            single.effects[0].kind,
-            REFITTED,
-            single.delta_chi2,
-            single.sigma,
-            single.numbers,
-            single.plausible,
-            name in step.answer_names,
-            rejected.get(name, single.reason),
-            along=single.others if name in step.answer_names else (),
-        )
-        for name, single in singles.items()
-        if name not in {effect.name for effect in tests.effects}
-    ]
+            rows.append(row)
     rows += [
         Candidate(name, "", NOT_TESTABLE, reason=reason)
         for name, reason in not_testable.items()
@@ -297,25 +273,30 @@ def _contains_answer(effect: Effect, step: SelectionStep) -> Remark:
     return remark(CONTAINS, name=contained[0]) if contained else Remark()
 
 
-def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
-    """Add the ladder: the errors of every model."""
-    from vinetrack.diagnosis.ladder import ladder
-
-    report("errors before and after")
+def _or_note(result: Diagnosis, code: str, found: Callable[[], Diagnosis]) -> Diagnosis:
+    """A diagnosis with more, or with a note why this cannot be computed."""
     try:
-        partial_effects = [step.effect for last in result.rounds[-1:] for step in last.partial]
-        partial_fits = [fit for last in result.rounds[-1:] for fit in last.partial_fits]
-        table = ladder((*result.fits, *partial_fits), ("", *result.effects, *partial_effects), len(partial_effects))
-        return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
-    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, remark("no_ladder", error=str(error))))
+        return found()
+    except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
+        return replace(result, notes=(*result.notes, remark(code, error=str(error))))
+
+
+def _with_ladder(result: Diagnosis) -> Diagnosis:
+    """Add the ladder: the errors of every model."""
+    last = result.rounds[-1]
+    added = ("", *result.effects, *(step.effect for step in last.partial))
+    table = error_ladder((*result.fits, *last.partial_fits), added, len(last.partial))
+    return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
     """Add where the first model fails, the force it lacks if no effect explains it, and the next experiment."""
-    result = _located(result, report) if result.verdict != ADEQUATE else result
+    if result.verdict != ADEQUATE:
+        report("where it fails")
+        result = _or_note(result, "not_located", partial(_located, result))
     if UNEXPLAINED in (result.verdict, result.final_verdict):
-        result = _with_missing_force(result, report)
+        report("computing the missing force")
+        result = _or_note(result, "no_missing_force", partial(_with_missing_force, result))
     return with_next_experiment(result, limits, report)
 
 
@@ -330,34 +311,24 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     from vinetrack.diagnosis.further_trials import next_experiment
 
     report("looking for the next experiment")
-    try:
-        return replace(result, next_experiment=next_experiment(tied, limits).to_json())
-    except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, remark("no_next_experiment", error=str(error))))
+    found = lambda: replace(result, next_experiment=next_experiment(tied, limits).to_json())  # noqa: E731
+    return _or_note(result, "no_next_experiment", found)
 
 
-def _located(result: Diagnosis, report: Report) -> Diagnosis:
+def _located(result: Diagnosis) -> Diagnosis:
     """Add where the first model fails, and which of its parameters drift."""
     from vinetrack.diagnosis.locate import locate
 
-    report("where it fails")
-    try:
-        failure = locate(result.fits[0])
-    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, remark("not_located", error=str(error))))
+    failure = locate(result.fits[0])
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
     return replace(result, failure=failure, where=failure.remarks(), drift=drift)
 
 
-def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:
+def _with_missing_force(result: Diagnosis) -> Diagnosis:
     """Add the force that the first model lacks, and the simple law that it resembles."""
     from vinetrack.diagnosis.missing_force import missing_force
 
-    report("computing the missing force")
-    try:
-        force = missing_force(result.fits[0])
-    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, remark("no_missing_force", error=str(error))))
+    force = missing_force(result.fits[0])
     explanation = f"{result.explanation} {force.sentence}"
     learned = None if force.learned is None else force.learned.table
     return replace(

@@ -5,9 +5,8 @@ The answer set holds every hypothesis that the data cannot exclude.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,15 +16,10 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
 from vinetrack.diagnosis.score_test import is_plausible, plausible_range, slip_of
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
-from vinetrack.inference.fit import refit
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.marginal_likelihood import (
-    FitState,
-    MixedProblem,
     deviance,
     estimate_between_trial_sd,
     marginal,
@@ -88,16 +82,18 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
     """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit. The deviation of each trial is a
     column of the linear mixed model already, and the columns of the coefficients are multiples of it.
     """
-    cross_products, problem, state = _widened(fit, base, difference)
-    before = marginal(base.cross_products, base.problem, base.state)
-    after = marginal(cross_products, problem, state)
+    return _deviance(base, base, spread) - _deviance(_widened(fit, base, difference), base, spread)
+
+
+def _deviance(solution: Solution, base: Solution, spread: tuple[float, float] | None = None) -> float:
+    """−2 ln L, minimised over the parameters and, unless given, the between-trial standard deviations that `base`
+    estimates.
+    """
+    problem, state = solution.problem, solution.state
+    part = marginal(solution.cross_products, problem, state)
     if spread is None:
-        sd_before = estimate_between_trial_sd(before, base.problem, base.state, base.estimable, restricted=False)
-        sd_after = estimate_between_trial_sd(after, problem, state, base.estimable, restricted=False)
-    else:
-        sd_before = sd_after = spread
-    deviance_before = deviance(before, base.problem, base.state, sd_before, restricted=False)
-    return deviance_before - deviance(after, problem, state, sd_after, restricted=False)
+        spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
+    return deviance(part, problem, state, spread, restricted=False)
 
 
 def with_shared_errors(fit: Fit, base: Solution) -> Solution:
@@ -127,9 +123,9 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     )
 
 
-def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, MixedProblem, FitState]:
-    """Cross products, problem and state of a solution with the coefficients of a difference added, all zero. Each is a
-    multiple of a column that the solution has: that of a trial's deviation, or of a parameter that vines shared.
+def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
+    """A solution with the coefficients of a difference added, all zero. Each is a multiple of a column that the
+    solution has: that of a trial's deviation, or of a parameter that vines shared.
     """
     columns, groups, factors, precisions = [], [], [], []
     for term in difference.terms:
@@ -163,7 +159,7 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
         T[:, column, size - 1 + k] = np.where(problem.index[:, base.problem.index.shape[1] + k] >= 0, factor, 0.0)
     cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
     theta = np.append(base.state.theta, np.zeros(precision.size))
-    return cross_products, problem, replace(base.state, theta=theta)
+    return replace(base, cross_products=cross_products, problem=problem, state=replace(base.state, theta=theta))
 
 
 # ------------------------------------------------------------------------------
@@ -187,17 +183,6 @@ def film_gain(fit: Fit) -> float:
         return 0.0
     base = with_smooth_errors(fit)
     return max(_deviance(base, base) - _deviance(with_errors(fit, base, errors), base), 0.0)
-
-
-def _deviance(solution: Solution, base: Solution) -> float:
-    """−2 ln L, minimised over the parameters and over the between-trial standard deviations that `base` estimates."""
-    part, problem, state = (
-        marginal(solution.cross_products, solution.problem, solution.state),
-        solution.problem,
-        solution.state,
-    )
-    spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
-    return deviance(part, problem, state, spread, restricted=False)
 
 
 # ------------------------------------------------------------------------------
@@ -306,6 +291,7 @@ class LikelihoodRatio:
     prior_penalty: float = 0.0  #: penalty of sizes outside their plausible range, on the scale of −2 ln L
     log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.likelihood_ratio`
     film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.likelihood_ratio`
+    split: tuple[str, ...] = ()  #: parameters of the model that it splits by groups of trials
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -328,16 +314,15 @@ class LikelihoodRatio:
     @property
     def numbers(self) -> tuple[Number, ...]:
         """Fitted sizes of its effects, without those that no trajectory depends on."""
-        return tuple(
-            number
-            for number in self.fit.numbers
-            if number.key.split(".")[0] in self.names and math.isfinite(number.sigma)
-        )
+        return tuple(number for number in self.fit.numbers if self._adds(number) and math.isfinite(number.sigma))
 
     @property
     def others(self) -> tuple[Number, ...]:
         """All other parameters of its fit."""
-        return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
+        return tuple(number for number in self.fit.numbers if not self._adds(number))
+
+    def _adds(self, number: Number) -> bool:
+        return number.key.split(".")[0] in self.names or number.key in self.split
 
     def deviance_excess(self, other: LikelihoodRatio) -> float:
         """−2 ln L of this hypothesis minus that of another."""
@@ -554,42 +539,3 @@ def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     """Whether an effect of one declares that it contains an effect of the other (`replaces`)."""
     replaced = {name for effect in hypothesis.effects for name in effect.replaces}
     return bool(replaced & set(other.names))
-
-
-# ------------------------------------------------------------------------------
-# Simpler forms of an effect that contains another as a special case, refitted from where the larger one ended.
-
-
-# A hypothesis and its ln L, one of its effects, and the simpler form of that effect
-NestedForm = tuple[str, float, str, str]
-
-
-def simpler_forms(
-    before: Fit, hypothesis: LikelihoodRatio, effects: Sequence[Effect], tried: set[NestedForm]
-) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
-    """Refit a hypothesis with one of its effects replaced by a simpler effect that it contains."""
-    for larger in hypothesis.effects:
-        for simpler in effects:
-            contained = simpler.name in larger.replaces and simpler.name not in hypothesis.names
-            if not contained or _needs_larger_form(hypothesis.fit, larger, simpler):
-                continue
-            form = "+".join(sorted(hypothesis.names)), hypothesis.fit.log_likelihood, larger.name, simpler.name
-            if form in tried:
-                continue
-            tried.add(form)
-            replaced = tuple(simpler if effect is larger else effect for effect in hypothesis.effects)
-            model = before.model.with_effects(replaced)
-            values = hypothesis.fit.model.values
-            sizes = {f"{simpler.name}.{p.name}": values.get(f"{larger.name}.{p.name}") for p in simpler.parameters}
-            start = {key: size for key, size in sizes.items() if size is not None}
-            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
-                yield replaced, refit(hypothesis.fit, model, start=start, thorough=False)
-
-
-def _needs_larger_form(fit: Fit, larger: Effect, simpler: Effect) -> bool:
-    """Whether a parameter that only the larger form has differs from zero beyond doubt."""
-    additional = {p.name for p in larger.parameters} - {p.name for p in simpler.parameters}
-    numbers = [n for n in fit.numbers if n.key.split(".")[0] == larger.name and n.key.split(".")[1] in additional]
-    # 6.0: standard errors by which an additional parameter must differ from zero for the simpler form to be ruled
-    # out without a fit
-    return any(math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > 6.0 * n.sigma for n in numbers)

@@ -43,6 +43,11 @@ class Confounder(JsonRecord):
     low_95: OrNaN
     high_95: OrNaN
 
+    @property
+    def shift(self) -> float:
+        """How far the size may be off."""
+        return abs(self.value - self.number.value)
+
 
 def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
     """The 95 % interval of a size with each of these effects left free (hull). Returns low, high : SI."""

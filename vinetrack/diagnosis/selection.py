@@ -32,13 +32,11 @@ from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
     LikelihoodRatio,
-    NestedForm,
     answer_set,
     best_of,
     in_sigmas,
     likelihood_ratio,
     robust_ratio,
-    simpler_forms,
     sizes_of,
 )
 from vinetrack.diagnosis.locate import drift
@@ -51,7 +49,7 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
-from vinetrack.diagnosis.score_test import levers_of, plausible_range
+from vinetrack.diagnosis.score_test import CandidateShape, levers_of, plausible_range
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
@@ -81,8 +79,8 @@ Names = frozenset[str]
 class EffectSets:
     """Sets of effects fitted from one model, by their names. A set is fitted again only from a better start."""
 
-    def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio], report: Report) -> None:
-        self.search, self.report = search, report
+    def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio]) -> None:
+        self.search = search
         self.before = search.tests.fit
         self.effects = search.tests.effects
         self.fitted: dict[Names, LikelihoodRatio] = {}
@@ -90,7 +88,6 @@ class EffectSets:
             self._keep_best(single)
         self.extended: set[Names] = set()
         self.left_out: set[tuple[str, str]] = set()
-        self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
         """Fitted sets of this many effects, the highest likelihood first."""
@@ -105,15 +102,9 @@ class EffectSets:
             if names in self.extended:
                 continue
             self.extended.add(names)
-            search = CandidateFits(self.search.tests_after(base.fit), self.report)
-            partners = search.fit(n_partners)
-            for name, log_likelihood, larger, simpler in search.nested_tried:
-                self.nested_tried.add(("+".join(sorted((*base.names, name))), log_likelihood, larger, simpler))
-            for partner in partners:
+            search = CandidateFits(self.search.tests_after(base.fit), self.search.report)
+            for partner in search.fit(n_partners):
                 self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
-        for hypothesis in self.of_size(size)[:n_partners]:
-            for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.nested_tried):
-                self._keep_best(likelihood_ratio(self.before, effects, fit))
         return self.of_size(size)
 
     def _bases(self, size: int) -> list[LikelihoodRatio]:
@@ -143,7 +134,7 @@ class EffectSets:
         others = tuple(other for other in hypothesis.effects if other is not effect)
         if (hypothesis.label, effect.name) not in self.left_out:
             self.left_out.add((hypothesis.label, effect.name))
-            self.report(f"taking out {effect.name}")
+            self.search.report(f"taking out {effect.name}")
             fit = self._refitted(hypothesis.fit, others)
             if fit is not None:
                 self._keep_best(likelihood_ratio(self.before, others, fit))
@@ -166,15 +157,9 @@ class EffectSets:
             return None
 
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
-        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known. Δχ² is
-        divided by the inflation of the member's own sizes, and has a degree of freedom for each (`sizes_of`).
-        """
+        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known."""
         others = self.leave_out(hypothesis, effect)
-        if others is None:
-            return 0.0
-        delta_chi2 = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
-        inflation = robust_ratio(hypothesis.fit, [effect.name]) ** 2
-        return in_sigmas(max(delta_chi2, 0.0) / inflation, sizes_of((effect,), hypothesis.fit))
+        return 0.0 if others is None else _worth(hypothesis, others, (effect,))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low."""
@@ -192,17 +177,12 @@ class EffectSets:
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
         """Whether a set is better than a smaller one by at least the threshold of its additional effect. The smaller
         set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any nested one
-        that was fitted, so the criterion is then the stricter. The difference of −2 ln L is divided by the inflation of
-        the sizes added: where they scatter between trials more widely than the noise model predicts, chance makes it
-        larger by as much (Kent, Biometrika 69, 19, 1982).
+        that was fitted, so the criterion is then the stricter.
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
         family = self.search.tests_after(smaller.fit).family
-        threshold = max(family.threshold(name) for name in hypothesis.names if name not in smaller.names)
         added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
-        delta_chi2 = 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood)
-        inflation = robust_ratio(hypothesis.fit, [effect.name for effect in added]) ** 2
-        return in_sigmas(delta_chi2 / inflation, sizes_of(added, hypothesis.fit)) >= threshold
+        return _worth(hypothesis, smaller, added) >= max(family.threshold(effect.name) for effect in added)
 
     def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.
@@ -228,6 +208,16 @@ class EffectSets:
             of_size = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
             drop_curves(of_size)
             self.fitted |= of_size
+
+
+def _worth(larger: LikelihoodRatio, smaller: LikelihoodRatio, added: Sequence[Effect]) -> float:
+    """Significance of what a set has more than another, in standard deviations. The difference of −2 ln L is divided by
+    the inflation of the sizes added: where they scatter between trials more widely than the noise model predicts,
+    chance makes it larger by as much (Kent, Biometrika 69, 19, 1982). Each size is a degree of freedom (`sizes_of`).
+    """
+    delta_chi2 = 2 * (larger.fit.log_likelihood - smaller.fit.log_likelihood)
+    inflation = robust_ratio(larger.fit, [effect.name for effect in added]) ** 2
+    return in_sigmas(delta_chi2 / inflation, sizes_of(added, larger.fit))
 
 
 # ------------------------------------------------------------------------------
@@ -305,69 +295,45 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
         return ()
     levers = levers_of(after.fit, after.products)
     chosen = []
-    for k, number in enumerate(after.fit.numbers):
+    for number, lever in zip(after.fit.numbers, levers, strict=True):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
-            relevant = [confounder for confounder in _of_number(after, number, levers[k]) if _is_relevant(confounder)]
+            # 1.0: shift, in standard errors of the size, from which a confounder is reported (chosen)
+            relevant = [each for each in _of_number(after, number, lever) if each.shift > 1.0 * number.sigma]
             # 3: confounders listed for each size (chosen)
-            chosen += sorted(relevant, key=lambda confounder: -abs(confounder.value - number.value))[:3]
+            chosen += sorted(relevant, key=lambda confounder: -confounder.shift)[:3]
     return tuple(chosen)
-
-
-def _is_relevant(confounder: Confounder) -> bool:
-    # 1.0: shift, in standard errors of the size, from which a confounder is reported (chosen)
-    return abs(confounder.value - confounder.number.value) > 1.0 * confounder.number.sigma
 
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
     """Every physical effect as a confounder of one size, in the shape that shifts the size most."""
-    physical = {effect.name: effect for effect in after.effects if effect.kind == "physical"}
-    confounders = []
-    for name in dict.fromkeys(after.sensitivities.effects):
+    confounders: dict[str, Confounder] = {}
+    for k, shape in enumerate(after.sensitivities.shapes):
         # An effect that contains the added one as a limit is an alternative to it, no confounder.
-        if name not in physical or number.key.split(".")[0] in physical[name].replaces:
+        effect, sigma = shape.effect, float(after.scores.sigma[k])
+        alternative = effect.kind != "physical" or number.key.split(".")[0] in effect.replaces
+        if alternative or not effect.parameters or shape.whole or not math.isfinite(sigma):
             continue
-        by_shape = [_in_shape(after, number, k, float(lever[k])) for k in after.ranked_shapes(name)]
-        informative = [confounder for confounder in by_shape if confounder is not None]
-        if informative:
-            confounders.append(max(informative, key=lambda confounder: abs(confounder.value - number.value)))
-    return confounders
+        confounder = _in_shape(number, shape, float(after.scores.size[k]), sigma, float(lever[k]))
+        if effect.name not in confounders or confounder.shift > confounders[effect.name].shift:
+            confounders[effect.name] = confounder
+    return list(confounders.values())
 
 
-def _in_shape(after: MisfitTests, number: Number, index: int, lever: float) -> Confounder | None:
-    """One shape of an effect as a confounder; None where the data hold no information about its size."""
-    shape = after.sensitivities.shapes[index]
-    sigma = float(after.scores.sigma[index])
-    if not shape.effect.parameters or shape.whole or not math.isfinite(sigma):
-        return None
-    mean, sd, limit = size_not_excluded(float(after.scores.size[index]), sigma, shape.size)
-    expected = number.value - lever * mean
-    half_width = _quantile(number) * math.hypot(number.sigma, lever * sd)
-    lower, upper = _bounds(after, number)
+def _in_shape(number: Number, shape: CandidateShape, size: float, sigma: float, lever: float) -> Confounder:
+    """One shape of an effect of such an estimated size as a confounder."""
+    mean, sd, limit = size_not_excluded(size, sigma, shape.size)
+    expected, quantile = number.value - lever * mean, 0.5 * (number.high - number.low) / number.sigma
+    half_width = max(quantile if math.isfinite(quantile) else 0.0, TWO_SIDED_95) * math.hypot(number.sigma, lever * sd)
     return Confounder(
         number=number,
         effect=shape.effect.name,
         symbol=shape.size.symbol,
         unit=shape.size.unit,
         limit=shape.size.zero + limit,
-        value=min(max(number.value - lever * limit, lower), upper),
-        low_95=max(min(number.low, expected - half_width), lower),
-        high_95=min(max(number.high, expected + half_width), upper),
+        value=min(max(number.value - lever * limit, number.lower), number.upper),
+        low_95=max(min(number.low, expected - half_width), number.lower),
+        high_95=min(max(number.high, expected + half_width), number.upper),
     )
-
-
-def _bounds(after: MisfitTests, number: Number) -> tuple[float, float]:
-    """Bounds of a parameter, SI."""
-    effect, _, name = number.key.partition(".")
-    parameters = next(
-        effect_of_model for effect_of_model in after.fit.model if effect_of_model.name == effect
-    ).parameters
-    return next(parameter.bounds for parameter in parameters if parameter.name == name)
-
-
-def _quantile(number: Number) -> float:
-    """Half width of the 95 % interval of a fitted size, in standard errors."""
-    quantile = 0.5 * (number.high - number.low) / number.sigma
-    return max(quantile, TWO_SIDED_95) if math.isfinite(quantile) else TWO_SIDED_95
 
 
 def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
@@ -483,7 +449,6 @@ class SelectionStep:
     fitted: tuple[LikelihoodRatio, ...] = ()
     rejected: tuple[tuple[str, Remark], ...] = ()
     answer_names: tuple[str, ...] = ()
-    search: CandidateFits | None = None
     note: Remark = field(default_factory=Remark)
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
@@ -514,7 +479,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     hypotheses += between
     only_suspected = not tests.rejects_model and not stated_difference
     if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
-        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
+        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
     rounds = None if _may_be_improved(hypotheses) else _single_effect_rounds(tests, search, hypotheses)
     if rounds is not None:
         return rounds
@@ -525,7 +490,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     if rounds is not None:
         return rounds
     if not tests.rejects_model and not tests.needs_search:
-        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
+        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
 
     # Sets of effects.
     hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in alone]
@@ -535,8 +500,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         rejected = tests.omnibus_rejects or tests.exceeds_slow_errors
         verdict = UNEXPLAINED if rejected else ADEQUATE
         unstated = unstated if verdict == ADEQUATE else ()
-        return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
-    return _effect_set_rounds(tests, search, hypotheses, report)
+        return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
+    return _effect_set_rounds(tests, search, hypotheses)
 
 
 def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
@@ -559,26 +524,10 @@ def _single_effect_rounds(
     tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
 ) -> list[SelectionStep] | None:
     """Rounds in which a single effect explains the misfit; None where none does."""
-    if not hypotheses:
-        return None
-    if not _exceeds_threshold(best_of(hypotheses), tests):
+    if not hypotheses or not _exceeds_threshold(best_of(hypotheses), tests):
         return None
     adequate, rejected, after = adequate_hypotheses(hypotheses, search)
-    if after is None:
-        return None
-    best, fitted = adequate[0], tuple(hypotheses)
-    verdict = verdict_of(adequate)
-    first = SelectionStep(
-        verdict,
-        tests,
-        tuple(adequate),
-        fitted,
-        tuple(rejected.items()),
-        tuple(hypothesis.names[0] for hypothesis in adequate),
-        search,
-        confounded=confounders_of(after, best.names) if verdict == MISSING else (),
-    )
-    return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
+    return None if after is None else _rounds(tests, EffectSets(search, hypotheses), adequate, rejected, after)
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
@@ -589,22 +538,22 @@ def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
 
 
 def _effect_set_rounds(
-    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio], report: Report
+    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
 ) -> list[SelectionStep]:
     """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`."""
     singles = sorted(hypotheses, key=lambda single: -single.fit.log_likelihood)
-    sets = EffectSets(search, singles, report)
+    sets = EffectSets(search, singles)
     size, backward_steps, best_so_far = 2, 0, singles[0]
     rejected: dict[str, Remark] = {}
     while size <= MAX_EFFECTS:
-        report(f"{size} effects together")
+        search.report(f"{size} effects together")
         of_this_size = sets.grow(size)
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
         adequate, rejected, after = adequate_hypotheses(of_this_size, search, sets)
         if after is not None:
             if sets.is_better(adequate[0]):
-                return _rounds_of_sets(tests, sets, adequate, rejected, after)
+                return _rounds(tests, sets, adequate, rejected, after)
             rejected[adequate[0].label] = remark("gain_within_chance")
         if not sets.is_better(of_this_size[0]):
             break
@@ -615,17 +564,17 @@ def _effect_set_rounds(
     fitted = tuple(sets.fitted.values())
     reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
     steps = _partial_steps(tests, sets)
-    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, search=search, rejected=reasons, partial=steps)]
+    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, rejected=reasons, partial=steps)]
 
 
-def _rounds_of_sets(
+def _rounds(
     tests: MisfitTests,
     sets: EffectSets,
     adequate: Sequence[LikelihoodRatio],
     rejected: dict[str, Remark],
     after: MisfitTests,
 ) -> list[SelectionStep]:
-    """Rounds from adequate sets of effects: one for each effect that all sets share, then one for the alternatives.
+    """Rounds from adequate effects or sets of them: one for each effect that all share, then one for the alternatives.
     Physics comes before faults of the measurement, and within both the effect with the largest gain alone. A distortion
     of the picture whose leading term gains nearly everything comes first: the rest of the set may be its next term.
     """
@@ -640,28 +589,25 @@ def _rounds_of_sets(
         return name not in leading, kinds[name] == "measurement", -gains.get(name, 0.0)
 
     common = sorted(set.intersection(*(set(hypothesis.names) for hypothesis in adequate)), key=order)
-    if not common:
-        names = tuple(sorted(dict.fromkeys(name for hypothesis in adequate for name in hypothesis.names), key=order))
-        return [SelectionStep(AMBIGUOUS, tests, tuple(adequate), fitted, reasons, names, sets.search)]
-    shared = common if len(adequate) > 1 else common[:-1]
     steps: list[SelectionStep] = []
     added: tuple[Effect, ...] = ()
-    round_tests = tests
-    for name in shared:
-        if kinds[name] == "measurement":
-            return [*steps, _shared_step(ARTEFACT, round_tests, sets, best, added, name, fitted, reasons)]
-        steps.append(_shared_step(MISSING, round_tests, sets, best, added, name, fitted, reasons))
+    round_tests, alternatives = tests, tuple(adequate)
+    for name in common if len(adequate) > 1 else common[:-1]:
+        verdict = ARTEFACT if kinds[name] == "measurement" else MISSING
+        steps.append(_shared_step(verdict, round_tests, sets, best, added, name, reasons))
+        if verdict == ARTEFACT:
+            return steps
         added = (*added, next(effect for effect in best.effects if effect.name == name))
         subset = sets.subset(best, added)
         round_tests = sets.search.tests_after(subset.fit if subset else best.fit)
-    alternatives = tuple(_remainder(round_tests, hypothesis, added) for hypothesis in adequate)
+    if added:
+        alternatives = tuple(_remainder(round_tests, hypothesis, added) for hypothesis in adequate)
+        fitted, reasons = alternatives, ()
     verdict = verdict_of(alternatives)
     names = tuple(sorted(dict.fromkeys(name for hypothesis in alternatives for name in hypothesis.names), key=order))
     confounded = confounders_of(after, best.names) if verdict == MISSING else ()
-    steps.append(
-        SelectionStep(verdict, round_tests, alternatives, alternatives, answer_names=names, confounded=confounded)
-    )
-    return [*steps, SelectionStep(ADEQUATE, after)] if verdict == MISSING else steps
+    last = SelectionStep(verdict, round_tests, alternatives, fitted, reasons, names, confounded=confounded)
+    return [*steps, last, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [*steps, last]
 
 
 def _shared_step(
@@ -671,7 +617,6 @@ def _shared_step(
     best: LikelihoodRatio,
     added: tuple[Effect, ...],
     name: str,
-    fitted: tuple[LikelihoodRatio, ...],
     rejected: tuple[tuple[str, Remark], ...],
 ) -> SelectionStep:
     """The round that names an effect which all sets share; the effects in `added` are in the model already."""
@@ -680,10 +625,10 @@ def _shared_step(
     together = likelihood_ratio(tests.fit, remaining, best.fit)
     note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
     if not added:
-        return SelectionStep(verdict, tests, (together,), fitted, rejected, (name,), sets.search, note)
+        return SelectionStep(verdict, tests, (together,), tuple(sets.fitted.values()), rejected, (name,), note)
     subset = sets.subset(best, (*added, remaining[0]))
     fits = (together,) if subset is None else (likelihood_ratio(tests.fit, remaining[:1], subset.fit), together)
-    return SelectionStep(verdict, tests, (together,), fits, (), (name,), None, note)
+    return SelectionStep(verdict, tests, (together,), fits, answer_names=(name,), note=note)
 
 
 def _remainder(tests: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Effect]) -> LikelihoodRatio:
