@@ -272,7 +272,7 @@ LAWS = [
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
-    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1.0)
+    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, 1.0)
     path.write_text(effect_text(RankedLaw(law, estimate, 0.0), "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]

@@ -31,7 +31,12 @@ from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import splines, whiten
-from vinetrack.inference.marginal_likelihood import eliminated, inverse_of_block, trial_effect_prior
+from vinetrack.inference.marginal_likelihood import (
+    DEVIATION_COLUMNS,
+    eliminated,
+    inverse_of_block,
+    trial_effect_prior,
+)
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
 
@@ -344,14 +349,12 @@ class ForcePoint:
 
 class ForceEstimate(NamedTuple):
     """Least-squares estimate of coefficients of a force, N, and the fall of χ² that they bring. `sigma` is the root
-    mean square standard error of a coefficient. `parameter_shift` is how far the model parameters move along, in the
-    fit's own scaling.
+    mean square standard error of a coefficient.
     """
 
     delta_chi2: float
     amplitude: Floats
     sigma: float
-    parameter_shift: Floats
     degrees_of_freedom: float
 
     @property
@@ -450,28 +453,33 @@ class ForceEquations:
             for motion, columns, push in zip(point.motions, point.by_parameters, pushes, strict=True)
         ]  # fmt: skip
         sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
-        total = np.zeros((p + q + 1, p + q + 1))
-        self.of_effects, of_trials = [], []
-        for i, of_trial in enumerate(sensitivities):
-            index = problem.prior.index[i]
-            places = np.concatenate([np.where(index >= 0, index, p + q + 1), np.arange(p, p + q + 1)])
-            known = np.flatnonzero(places <= p + q)
-            block, response = self._without_effects(i, of_trial)
-            of_trials.append(block)
-            places = places[known]
-            total[np.ix_(places, places)] += block[np.ix_(known, known)]
-            self.of_effects.append((places, response[:, known]))
-        self.of_trials = np.array(of_trials)
+        rows = [self._rows(i, of_trial) for i, of_trial in enumerate(sensitivities)]
+        self.of_trials, self.of_effects = eliminated(np.array(rows), problem.effects_precision)
+        # Parameters, coefficients, residual; in the last row what no unknown belongs to
+        shared = np.broadcast_to(np.arange(p, p + q + 1), (len(rows), q + 1))
+        self.places = np.hstack([np.where(problem.prior.index < 0, p + q + 1, problem.prior.index), shared])
+        total = np.zeros((p + q + 2, p + q + 2))
+        for places, block in zip(self.places, self.of_trials, strict=True):
+            total[np.ix_(places, places)] += block
+        total = total[:-1, :-1]
         held = np.flatnonzero(~problem.prior.free)
         total[held] = total[:, held] = 0.0
-        own = np.diag(total)[p:-1]
-        self.ridge = LEAST_INFORMATION * np.maximum(own, max(1e-6 * own.max(), 1e-300))
-        reduced, self.of_parameters = self._without_parameters(total, np.diag(total)[:p].copy())
-        self.cost = float(total[-1, -1])
-        self.information, self.score, self.chi2 = reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
+        own = np.diag(total).copy()
+        self.ridge = LEAST_INFORMATION * np.maximum(own[p:-1], max(1e-6 * own[p:-1].max(), 1e-300))
+        from_mean = np.where(problem.prior.free, point.theta - problem.prior.prior_mean, 0.0)
+        total[:p, -1] -= problem.prior.prior_precision * from_mean
+        total[-1, :p] = total[:p, -1]
+        self.cost = float(total[-1, -1] + problem.prior.prior_precision @ from_mean**2)
+        square = total[:p, :p] + np.diag(problem.precision)
+        # 1e-9: share of its information below which what other unknowns leave of a parameter is rounding (derived)
+        determined = np.flatnonzero(np.diag(square) > 1e-9 * np.maximum(own[:p], 1e-300))
+        self.of_parameters = inverse_of_block(square, determined) @ total[:p, p:]
+        reduced = total[p:, p:] - total[p:, :p] @ self.of_parameters
+        self.information, self.score = reduced[:-1, :-1], reduced[:-1, -1]
+        self.chi2 = self.cost - float(total[-1, :p] @ self.of_parameters[:, -1])
 
-    def _without_effects(self, trial: int, sensitivities: Floats) -> tuple[Floats, Floats]:
-        """Products of [parameters, coefficients, residual] of a trial, its effects eliminated, and their response."""
+    def _rows(self, trial: int, sensitivities: Floats) -> Floats:
+        """Products of [trial effects, parameters, coefficients, residual] of a trial, with the prior of its effects."""
         problem, trial_data = self.problem, self.problem.data[trial]
         motion, effects = self.point.motions[trial], self.point.trial_effects[trial]
         since_s = trial_data.time_s - effects[RELEASE]
@@ -483,29 +491,11 @@ class ForceEquations:
         used = slice(0, int(ended[0]) if ended.size else None)
         relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
         white = whiten(rows[used], trial_data.first[used], problem.rho, relative_sd)
-        gram, precision = white.T @ white / problem.variance[trial], problem.effects_precision[trial]
-        pull = precision * (effects - problem.effects_mean[trial])
-        gram[:N_TRIAL_EFFECTS, -1] -= pull
-        gram[-1, :N_TRIAL_EFFECTS] -= pull
-        gram[-1, -1] += pull @ (effects - problem.effects_mean[trial])
-        (block,), (response,) = eliminated(gram[None], precision[None])
-        return block, response
-
-    def _without_parameters(self, total: Floats, information: Floats) -> tuple[Floats, Floats]:
-        """Products with the prior of the parameters, which are then eliminated, and the response of these. `total` is
-        changed; `information` is that on each parameter before anything was eliminated. Shapes: information (p,).
-        """
-        problem, p = self.problem, self.point.theta.size
-        from_mean = np.where(problem.prior.free, self.point.theta - problem.prior.prior_mean, 0.0)
-        pull = problem.prior.prior_precision * from_mean
-        total[:p, -1] -= pull
-        total[-1, :p] -= pull
-        total[-1, -1] += pull @ from_mean
-        square = total[:p, :p] + np.diag(problem.precision)
-        # 1e-9: share of its information below which what other unknowns leave of a parameter is rounding (derived)
-        determined = np.flatnonzero(np.diag(square) > 1e-9 * np.maximum(information, 1e-300))
-        response = inverse_of_block(square, determined) @ total[:p, p:]
-        return total[p:, p:] - total[p:, :p] @ response, response
+        gram, from_mean = white.T @ white / problem.variance[trial], effects - problem.effects_mean[trial]
+        gram[:N_TRIAL_EFFECTS, -1] -= problem.effects_precision[trial] * from_mean
+        gram[-1, :N_TRIAL_EFFECTS] = gram[:N_TRIAL_EFFECTS, -1]
+        gram[-1, -1] += problem.effects_precision[trial] @ from_mean**2
+        return np.asarray(gram)
 
     def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
         """Least squares for some of the coefficients, the others as they are. Standard errors are the larger of those
@@ -528,7 +518,7 @@ class ForceEquations:
         robust = covariance @ (scores.T @ scores * clusters) @ covariance
         variance = max(float(np.trace(covariance)), float(np.trace(robust))) / change.size
         dof = float(np.trace(covariance @ information))
-        return ForceEstimate(float(score @ change), change, math.sqrt(variance), shift, dof)
+        return ForceEstimate(float(score @ change), change, math.sqrt(variance), dof)
 
     def chi2_with(self, coefficients: Floats) -> float:
         """χ² with these coefficients, all other unknowns estimated anew."""
@@ -543,18 +533,15 @@ class ForceEquations:
         change = coefficients - self.coefficients
         theta = point.theta + self.of_parameters[:, -1] - self.of_parameters[:, :-1] @ change
         theta = np.clip(theta, prior.lower, prior.upper)
-        step = np.concatenate([theta - point.theta, change])
-        effects, pushes = point.trial_effects.copy(), []
-        for i, (places, response) in enumerate(self.of_effects):
-            of_trial = response[:, -1] - response[:, :-1] @ step[places[:-1]]
-            limit_s = 2 * self.problem.data[i].frame_s
-            of_trial[RELEASE] = np.clip(of_trial[RELEASE], -limit_s, limit_s)
-            effects[i] += of_trial
-            by_key = np.append(step[: theta.size], 0.0)[prior.index[i]]
-            by_all = [of_trial[PRESSURE], of_trial[DAMPING_DEVIATION], *by_key, *change, 1.0]
-            pushes.append(self.accelerations[i] @ np.array(by_all))
+        step = np.concatenate([theta - point.theta, change, [0.0, 0.0]])[self.places[:, :-1]]
+        effects = self.of_effects[:, :, -1] - np.einsum("nek,nk->ne", self.of_effects[:, :, :-1], step)
+        limits_s = np.array([2 * trial_data.frame_s for trial_data in self.problem.data])
+        effects[:, RELEASE] = np.clip(effects[:, RELEASE], -limits_s, limits_s)
+        by_all = np.column_stack([effects[:, DEVIATION_COLUMNS], step, np.ones(len(effects))])
+        pushes = [columns @ sizes for columns, sizes in zip(self.accelerations, by_all, strict=True)]
         dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
-        return theta, effects, [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
+        motions = [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
+        return theta, point.trial_effects + effects, motions
 
 
 def settled(equations: ForceEquations, estimate: Callable[[ForceEquations], Floats]) -> tuple[float, ForcePoint]:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from types import CodeType, SimpleNamespace
 
 import numpy as np
 
@@ -70,36 +72,41 @@ class Law:
         # 1e-3: least width of a local force that is reported (chosen)
         return self.kind == "patch" and not self.high - max(self.low, 0.0) > 1e-3
 
+    @property
+    def shape_values(self) -> tuple[float, ...]:
+        """Values of the shape parameters of its form, SI; the phase of a periodic law is free."""
+        if self.kind == "patch":
+            return self.low, self.high - self.low
+        return (self.scale, 0.0) if self.kind == "periodic" else (self.scale,) * len(FORMS[self.kind].shapes)
+
     def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
+        """The force of each unit amplitude along a motion: as it is and, where periodic, a quarter of a period ahead.
+        Shape (n_times, n_amplitudes).
+        """
         size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
-        force = size * FORMS[self.kind].along(self, motion).reshape(motion.time_s.size, -1)
-        return force * FORMS[self.factor].along(self, motion)[:, None] if self.factor else force
+        phases = [self.shape_values] if self.kind != "periodic" else [(self.scale, 0.0), (self.scale, math.pi / 2)]
+        force = np.column_stack([FORMS[self.kind].along(motion, shapes) for shapes in phases])
+        return size * (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force)
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
         """Describe the law with its size."""
         return str(remark("law", law=self, amplitude_N=amplitude_N, sigma_N=sigma_N))
 
 
-def _patch(law: Law, motion: FittedMotion) -> Floats:
-    edge = EDGE_FRACTION * (law.high - law.low)
-    y = motion.lead_position_m
-    return np.asarray(0.5 * (np.tanh((y - law.low) / edge) - np.tanh((y - law.high) / edge)))
-
-
-def _periodic(law: Law, motion: FittedMotion) -> Floats:
-    phase = 2 * math.pi * motion.lead_position_m / law.scale
-    return np.column_stack([np.sin(phase), np.cos(phase)])
+# States of a motion by their names in an effect file
+STATE = {
+    "lead_position": "lead_position_m", "tail_position": "tail_position_m", "tail_velocity": "tail_velocity_m_s",
+    "pressure": "pressure_Pa", "time": "time_s",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class LawForm:
-    """How a kind of law is computed along motions, and how it is written in an effect file: its size (name, symbol,
-    exponents of its unit in N, m, s and Pa), its shape as code and as a formula, and its shape parameters (name,
-    symbol, unit). `variable` is what it depends on, `times` what it is also tried multiplied by.
+    """A kind of law as an effect file holds it: its size (name, symbol, exponents of its unit in N, m, s and Pa), its
+    shape as code and as a formula, and its shape parameters (name, symbol, unit). `variable` is what it depends on,
+    `times` what it is also tried multiplied by.
     """
 
-    along: Callable[[Law, FittedMotion], Floats]
     variable: str
     size: tuple[str, str, tuple[int, int, int, int]]
     code: str
@@ -107,73 +114,64 @@ class LawForm:
     shapes: tuple[tuple[str, str, str], ...] = ()
     times: tuple[str, ...] = ()
 
+    @cached_property
+    def _compiled(self) -> CodeType:
+        return compile(self.code, "law", "eval")
 
-_FORCE = ("F", "F", (1, 0, 0, 0))
+    def along(self, motion: FittedMotion, shapes: Sequence[float] = ()) -> Floats:
+        """The shape along a motion, as its code says, shape (n_times,)."""
+        state = SimpleNamespace(**{name: getattr(motion, attribute) for name, attribute in STATE.items()})
+        known = dict(zip((name for name, _, _ in self.shapes), shapes, strict=True))
+        return np.asarray(eval(self._compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
+
+
+_FORCE, _FORCE_BY_M = ("F", "F", (1, 0, 0, 0)), ("k", "k", (1, -1, 0, 0))
 _V_0, _V_1 = (("v_0", "v₀", "m/s"),), (("v_1", "v₁", "m/s"),)
 _BY_BOTH, _BY_PRESSURE = ("speed", "pressure"), ("pressure",)
+_EDGE = f"({EDGE_FRACTION} * width)"
 FORMS = {
-    "constant": LawForm(lambda _, m: np.ones(m.time_s.size), "", _FORCE, "1.0", "F"),
-    "position": LawForm(
-        lambda _, m: m.tail_position_m, "growth", ("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x", times=_BY_BOTH
-    ),
-    "speed": LawForm(
-        lambda _, m: m.tail_velocity_m_s,
-        "speed", ("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE,
-    ),
+    "constant": LawForm("", _FORCE, "1.0", "F"),
+    "position": LawForm("growth", _FORCE_BY_M, "s.tail_position", "k x", times=_BY_BOTH),
+    "speed": LawForm("speed", ("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE),
     "speed_squared": LawForm(
-        lambda _, m: m.tail_velocity_m_s**2,
-        "speed", ("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure"),
+        "speed", ("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure")
     ),
     "position_squared": LawForm(
-        lambda _, m: m.tail_position_m**2,
-        "growth", ("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH,
+        "growth", ("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH
     ),
     "beyond_a_place": LawForm(
-        lambda law, m: np.maximum(m.lead_position_m - law.scale, 0.0),
-        "growth", ("k", "k", (1, -1, 0, 0)), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
+        "growth", _FORCE_BY_M, "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
         (("y_0", "y₀", "m"),), _BY_BOTH,
     ),
     "speed_cubed": LawForm(
-        lambda _, m: m.tail_velocity_m_s**3,
-        "speed", ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³",
+        "speed", ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³"
     ),
     "beyond_a_speed": LawForm(
-        lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0),
-        "speed", ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", _V_1,
+        "speed", ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", _V_1
     ),
     "squared_beyond_a_speed": LawForm(
-        lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0) ** 2,
-        "speed", ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", _V_1,
+        "speed", ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", _V_1
     ),
-    "pressure": LawForm(lambda _, m: m.pressure_Pa, "pressure", ("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
-    "time": LawForm(lambda _, m: m.time_s, "time", ("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
+    "pressure": LawForm("pressure", ("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
+    "time": LawForm("time", ("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
     "inverse_speed": LawForm(
-        lambda law, m: 1 / np.maximum(m.tail_velocity_m_s, law.scale),
-        "speed", _FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", _V_0, _BY_PRESSURE,
+        "speed", _FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", _V_0, _BY_PRESSURE
     ),
     "falling_with_speed": LawForm(
-        lambda law, m: np.exp(-m.tail_velocity_m_s / law.scale),
-        "speed", _FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", _V_0, _BY_PRESSURE,
+        "speed", _FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", _V_0, _BY_PRESSURE
     ),
-    "fading_in_time": LawForm(
-        lambda law, m: np.exp(-m.time_s / law.scale),
-        "time", _FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (("t_0", "t₀", "s"),),
-    ),
+    "fading_in_time": LawForm("time", _FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (("t_0", "t₀", "s"),)),
     "fading_along": LawForm(
-        lambda law, m: np.exp(-m.lead_position_m / law.scale),
-        "growth", _FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (("reach", "ℓ", "m"),), _BY_BOTH,
+        "growth", _FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (("reach", "ℓ", "m"),), _BY_BOTH
     ),
     "patch": LawForm(
-        _patch,
         "growth",
         _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
-        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
+        f"0.5 * (np.tanh((s.lead_position - y_1) / {_EDGE}) - np.tanh((s.lead_position - y_1 - width) / {_EDGE}))",
         f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
         (("y_1", "y₁", "m"), ("width", "w", "m")),
     ),
     "periodic": LawForm(
-        _periodic,
         "growth",
         _FORCE,
         "np.sin(2.0 * np.pi * s.lead_position / period + phi)",

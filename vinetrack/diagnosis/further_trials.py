@@ -26,7 +26,6 @@ from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
@@ -127,19 +126,12 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     """What to measure in order to exclude one of each pair of hypotheses: the effects whose files say so. Where a fault
     of the measurement is among them, a calibration decides, and only the calibration is named.
     """
-    trace_decides = False
-    effects: dict[str, Effect] = {}
-    for first, second in pairs:
-        both = (first.model, second.model), (second.model, first.model)
-        apart = [[effect for effect in model if effect.name not in other.names] for model, other in both]
-        in_trace = [any(effect.in_trace for effect in of_one) for of_one in apart]
-        trace_decides |= in_trace[0] != in_trace[1]
-        effects.update({effect.name: effect for effect in [*apart[0], *apart[1]]})
-    if not effects:
-        return Remark()
+    both_ways = [
+        (one.model, other.model) for first, second in pairs for one, other in ((first, second), (second, first))
+    ]
+    effects = {effect.name: effect for model, other in both_ways for effect in model if effect.name not in other.names}
     measured = [effect for effect in effects.values() if effect.kind == "measurement"]
-    known = {"trace_decides": trace_decides, "effects": measured or list(effects.values())}
-    return remark("deciding_measurements", **known, faults_only=bool(measured))
+    return remark("deciding_measurements", effects=measured or list(effects.values())) if effects else Remark()
 
 
 def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[Hypothesis]:

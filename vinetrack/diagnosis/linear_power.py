@@ -319,7 +319,7 @@ def _effect_power(
         at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, away, right=math.inf)
         steps = np.sign(steps) * np.where(away >= smallest, away, np.minimum(at_half_power, smallest))
     at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
-    taken_for, named_alone = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
+    taken_for = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
     zero, of_size = 0.0, {"parameter": "", "symbol": "size", "unit": "1"}
     if effect.parameters:
         size = shape.size
@@ -333,7 +333,6 @@ def _effect_power(
         largest=zero + far,
         sizes=tuple((zero + steps).tolist()),
         taken_for=taken_for,
-        named_alone=named_alone,
         other_values=shape.other_values,
     )
 
@@ -395,14 +394,13 @@ def error_inflation(tests: MisfitTests) -> Floats:
     return np.asarray(1 / np.sqrt(np.take_along_axis(remaining, best, axis=0)))
 
 
-def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Floats) -> tuple[dict[str, float], float]:
-    """How often each other candidate scores highest at a size, whose scores have this mean, and how often the effect is
-    named alone. Both among draws in which any candidate exceeds its threshold. A score counts where its size is
-    credible, see `likelihood_ratio`; an effect that contains another as a limit, be it this one or its rival, must be
-    better by the Δχ² of the answer set.
+def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Floats) -> dict[str, float]:
+    """How often each other candidate scores highest at a size, whose scores have this mean, among draws in which any
+    candidate exceeds its threshold. A score counts where its size is credible, see `likelihood_ratio`; an effect that
+    contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
     """
     if np.isnan(mean).any():
-        return {}, math.nan
+        return {}
     drawn, effects = null_scores + mean, np.array(tests.sensitivities.effects)
     far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.sensitivities.shapes]
     with np.errstate(invalid="ignore"):
@@ -410,22 +408,19 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     counted = np.maximum(np.where(credible, _sided(drawn, tests.signs), 0.0), 0.0) ** 2
     names = list(dict.fromkeys(tests.sensitivities.effects))
     squares = np.stack([counted[:, effects == name].max(axis=1) for name in names], axis=1)
-    itself = names.index(effect.name)
     limits = np.array([tests.family.threshold(name) for name in names])
     alarm = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(alarm) < DRAWS / 100:
-        return {}, math.nan
+        return {}
     containing = {other.name for other in tests.effects if effect.name in other.replaces}
     if any(name in effect.replaces for name in names):
         containing.add(effect.name)
     squares[:, [name in containing for name in names]] -= ANSWER_SET_DELTA_CHI2
-    squares = squares[alarm]
-    highest = np.argmax(squares, axis=1)
-    others = np.delete(squares, itself, axis=1).max(axis=1, initial=-math.inf)
-    rates = {name: float(np.mean(highest == k)) for k, name in enumerate(names) if k != itself}
+    highest = np.argmax(squares[alarm], axis=1)
+    rates = {name: float(np.mean(highest == k)) for k, name in enumerate(names) if name != effect.name}
     # 0.05: probability from which another candidate is listed (chosen)
     listed = sorted((name for name in rates if rates[name] >= 0.05), key=lambda name: -rates[name])
-    return {name: rates[name] for name in listed}, float(np.mean(squares[:, itself] - others > ANSWER_SET_DELTA_CHI2))
+    return {name: rates[name] for name in listed}
 
 
 def _false_alarms(fit: Fit) -> dict[str, float]:

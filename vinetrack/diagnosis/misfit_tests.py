@@ -146,18 +146,8 @@ def between_conditions_p(fit: Fit) -> float:
     """p-value that conditions differ in pressure or B no more than replicates do. 1 where replicates are too few, or
     where conditions differ by less than is usual in careful work.
     """
-    stated = [
-        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
-    ]
-    known = [relative for relative in stated if math.isfinite(relative)]
-    # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
-    pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
-    allowed = pressure, CAREFUL_DAMPING_SCATTER
-    p_values = [
-        _anova_p(deviations, *_grouping(fit), limit)
-        for deviations, limit in zip(_trial_deviations(fit), allowed, strict=True)
-    ]
-    return min(2 * min(p_values), 1.0)
+    known = [p for p, _ in _by_conditions(fit) if not math.isnan(p)]
+    return min(2 * min(known, default=1.0), 1.0)
 
 
 def has_excess_scatter(fit: Fit) -> bool:
@@ -165,47 +155,52 @@ def has_excess_scatter(fit: Fit) -> bool:
     have not where conditions differ by no more than replicates, or than is usual: deviations that compensate for a
     model are the same in replicates.
     """
-    allowed = CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER
-    return any(
-        spread > limit and not _differ_like_replicates(deviations, *_grouping(fit), limit)
-        for spread, limit, deviations in zip(fit.state.spread, allowed, _trial_deviations(fit), strict=True)
-    )
+    # 0.05: p-value from which conditions count as differing no more than their replicates (chosen)
+    return any(excess and not p > 0.05 for p, excess in _by_conditions(fit))
 
 
-def _trial_deviations(fit: Fit) -> tuple[Floats, Floats]:
-    """Deviations of pressure and of ln B, by trial."""
-    return (
+def _by_conditions(fit: Fit) -> list[tuple[float, bool]]:
+    """Of pressure and of ln B: the p-value that conditions differ no more than replicates do, and whether trials
+    scatter more than is usual.
+    """
+    stated = [
+        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
+    ]
+    known = [relative for relative in stated if math.isfinite(relative)]
+    # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
+    pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
+    of_trials = (
         np.array([trial.pressure_deviation for trial in fit.trials]),
         np.log1p([trial.damping_deviation for trial in fit.trials]),
     )
-
-
-def _grouping(fit: Fit) -> tuple[list[str], int]:
-    """The condition of each trial, and the number of parameters fitted to all."""
+    groups = [trial.trial.condition for trial in fit.trials]
     fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
-    return [trial.trial.condition for trial in fit.trials], fitted
-
-
-def _differ_like_replicates(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> bool:
-    """Whether groups differ by no more than their members do, or than is allowed; False where too few members tell.
-    With no more groups than parameters fitted to them, no difference between groups can show.
-    """
-    inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
-    testable = inner >= MIN_REPLICATE_DEGREES and outer > 0
-    # 0.05: p-value from which conditions count as differing no more than their replicates (chosen)
-    return testable and _anova_p(values, groups, fitted, allowed) > 0.05
+    return [
+        (_anova_p(deviations, groups, fitted, allowed), spread > usual)
+        for deviations, allowed, spread, usual in zip(
+            of_trials,
+            (pressure, CAREFUL_DAMPING_SCATTER),
+            fit.state.spread,
+            (CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER),
+            strict=True,
+        )
+    ]
 
 
 def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
-    """p-value of a one-way analysis of variance; 1 where the group means differ by less than `allowed`, rms."""
+    """p-value of a one-way analysis of variance; 1 where the group means differ by less than `allowed`, rms. NaN where
+    too few members tell; with no more groups than parameters fitted to them, no difference between groups can show.
+    """
     from scipy.stats import f
 
     names = sorted(set(groups))
     members = [values[[group == name for group in groups]] for name in names]
     within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
-    inner, outer = values.size - len(names), max(len(names) - fitted, 1)
+    inner, outer = values.size - len(names), len(names) - fitted
+    if inner < MIN_REPLICATE_DEGREES or outer < 1:
+        return math.nan
     between = sum(member.size * float(member.mean()) ** 2 for member in members)
-    if inner < MIN_REPLICATE_DEGREES or not within > 0 or math.sqrt(between / values.size) < allowed:
+    if not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
     within_variance = max(within / inner, allowed**2 / 9)

@@ -43,7 +43,6 @@ class EffectPower(JsonRecord):
     largest: Annotated[OrNaN, Field(alias="largest_plausible")]
     sizes: tuple[Annotated[float, or_open(math.inf)], ...]
     taken_for: Mapping[str, OrNaN] = field(default_factory=dict)
-    named_alone: OrNaN = math.nan
     other_values: tuple[float, ...] = ()
 
     def size_at(self, probability: float) -> float:

@@ -23,7 +23,7 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import CandidateFits
-from vinetrack.diagnosis.force_laws import FORMS
+from vinetrack.diagnosis.force_laws import FORMS, STATE
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
@@ -372,18 +372,15 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
     worked example.
     """
     law, form = detected.law, FORMS[detected.law.kind]
-    # What a law may be multiplied by: code, symbol, and the change of the unit of the size
-    factors = {
-        "": ("", "", (0, 0, 0, 0)),
-        "position": (" * s.tail_position", " x", (0, -1, 0, 0)),
-        "speed": (" * s.tail_velocity", " ẋ", (0, -1, 1, 0)),
-        "pressure": (" * s.pressure", " P", (0, 0, 0, -1)),
-    }
-    times, symbol, factor_unit = factors[law.factor]
-    unit = _unit([a + b for a, b in zip(form.size[2], factor_unit, strict=True)])
+    times, symbol, unit = "", "", list(form.size[2])
+    if law.factor:
+        by = FORMS[law.factor]
+        times, symbol = f" * {by.code}", f" {by.formula.split()[-1]}"
+        unit = [a + b for a, b in zip(unit, by.size[2], strict=True)]
+        unit[0] -= 1  # Not N²
     size, *shapes = (float(f"{value:.6g}") for value in _values(detected))
     limit = 100 * abs(size)
-    of_size = (*form.size[:2], unit)
+    of_size = (*form.size[:2], _unit(unit))
     parameters = [
         _parameter(of_size, repr(size), (-limit, limit), (0.0, 10 * size), 'meaning="size of the law"'),
         *(_shape_parameter(*each) for each in zip(form.shapes, shapes, strict=True)),
@@ -412,18 +409,12 @@ def _values(detected: RankedLaw) -> tuple[float, ...]:
     law, amplitude = detected.law, detected.estimate.amplitude
     if law.kind == "periodic":
         return math.hypot(*amplitude), law.scale, math.atan2(amplitude[1], amplitude[0])
-    size = amplitude[0] / law.peak
-    if law.kind == "patch":
-        return size, law.low, law.high - law.low
-    if law.kind == "inverse_speed":
-        return size / law.scale, law.scale
-    return (size, law.scale) if FORMS[law.kind].shapes else (size,)
+    return amplitude[0] / law.peak, *law.shape_values
 
 
 def _force_N(detected: RankedLaw) -> float:
     """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
-    suffix = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
-    state = {f"{name}{suffix[name]}": np.array([value]) for name, value in _WORKED_STATE.items()}
+    state = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
     motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
     return float((detected.law.unit_force(motion) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
 

@@ -214,18 +214,10 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 # The next experiment in sentences: trials to make, hypotheses that they separate, and what to measure instead.
 
 
-def measurement_text(trace_decides: bool, effects: Sequence[Effect], faults_only: bool) -> str:
+def measurement_text(effects: Sequence[Effect]) -> str:
     """Return what to measure in order to exclude one of the hypotheses, as the files of their effects state."""
-    with_trace = (
-        "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
-        " measured, and only the other hypothesis can explain a remaining misfit."
-    )
-    sentences = [with_trace] if trace_decides else []
-    for effect in effects:
-        words = " ".join(filter(None, ("" if faults_only else told_apart(effect), remedy(effect))))
-        if words:
-            sentences.append(f"{effect.name}: {words[0].lower()}{words[1:]}")
-    return " ".join(sentences)
+    told = [(effect.name, " ".join(filter(None, (told_apart(effect), remedy(effect))))) for effect in effects]
+    return " ".join(f"{name}: {words[0].lower()}{words[1:]}" for name, words in told if words)
 
 
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
@@ -579,34 +571,22 @@ def learned_force_text(
     text = (
         f"Learned as a smooth function inside the fit, the missing force is described by {choices}. As a function of"
         f" {_variables_text(name)} it ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard"
-        f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit. {_begins_text(begins, undecided_N)}"
-        " A law over other variables may fit the tracks as well."
+        f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit."
     ).replace("-", "−")
+    if begins:
+        size = f" (±{undecided_N:.2f} N)" if undecided_N else ""
+        text += f" Where growth begins it is {begins}: B, n and P_y could account for a part{size} that is constant."
+    else:
+        text += " These trials do not decide how much of it belongs to B, n and P_y."
     if not is_repeated:
         text += " No condition was repeated: how sure this is rests on the scatter that the fit assumes."
     if not has_pressures:
         text += " All trials had one pressure, so they do not show whether the force depends on it."
     if alternatives:
         text += (
-            " These trials do not tell which: trials that reach the same growth at another speed or time, by another"
-            " pressure or payload, would."
+            " Trials that reach the same growth at another speed or time, by another pressure or payload, would tell."
         )
     return text
-
-
-def _begins_text(begins: str, undecided_N: float) -> str:
-    """Return from where the force is measured, and which part of it the trials do not determine."""
-    from vinetrack.diagnosis.missing_force import CONSTANT_AT_START, FREE_AT_START
-
-    if not begins:
-        return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
-    from_start = "It is measured from where growth begins"
-    start = {
-        FREE_AT_START: "It is not zero where growth begins, since B, n and P_y cannot account for all that acts there",
-        CONSTANT_AT_START: f"{from_start}, except for a constant, which P_y cannot account for within its error",
-    }.get(begins, from_start)
-    size = f" (±{undecided_N:.2f} N)" if undecided_N else ""
-    return f"{start}. B, n and P_y could account as well for a part{size} that is the same all along the growth."
 
 
 def proposal_lines(proposal: Proposal) -> list[str]:

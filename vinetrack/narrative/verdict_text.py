@@ -54,28 +54,10 @@ def trials_differ(names: Sequence[str]) -> bool:
 
 
 def difference_in_words(result: LikelihoodRatio) -> str:
-    """The size of one difference between trials: `pressure rises by 0.42 ± 0.03 % with each trial`."""
-    name = result.names[-1]
-    if name == N_BY_VINE:
-        return "n differs between the vines: " + ", ".join(
-            f"{with_error(number.value, number.sigma)} ({number.vine})" for number in result.numbers
-        )
-    if name == ORDER_DRIFT:
-        slope = result.numbers[0]
-        if slope.key.endswith(".step"):
-            way = "higher" if slope.value > 0 else "lower"
-            return f"pressure is {way} by {with_error(100 * abs(slope.value), 100 * slope.sigma)} % {slope.vine}"
-        way = "rises" if slope.value > 0 else "falls"
-        what, each = ("B", "each trial of a tube") if slope.key.endswith(".B") else ("pressure", "each trial")
-        return f"{what} {way} by {with_error(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
-    told = (".B", "in B", 100, "%"), (".P", "in pressure (zero of the gauge, or P_y)", 1e-3, "kPa"), (
-        ".gain", "in pressure (setting of a regulator)", 100, "%",
-    )  # fmt: skip
-    parts = []
-    for ending, what, factor, unit in told:
-        if alike := [number for number in result.numbers if number.key.endswith(ending)]:
-            parts.append(f"{what} by {_range(alike, factor, unit)}")
-    return f"{name}s differ {' and '.join(parts)}"
+    """One difference between trials with its size: `specimens (tubes of one kind) differ: ΔlnB (specimen 2) = …`."""
+    more = len(result.numbers) - MOST_NAMED
+    sizes = f"{sizes_in_words(result.numbers[:MOST_NAMED])}{f' and {more} more' if more > 0 else ''}"
+    return f"{BETWEEN[result.names[-1]].summary}: {sizes}"
 
 
 def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = ()) -> str:
@@ -88,14 +70,6 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
     if (ORDER_DRIFT in names or SPECIMEN in names) and not trial_order(trials)[1]:
         text = f" The trials were assumed to be in the order of the rows.{text}"
     return text
-
-
-def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
-    """One coefficient with its standard error; several as a range."""
-    if len(numbers) == 1:
-        return f"{with_error(factor * numbers[0].value, factor * numbers[0].sigma)} {unit} ({numbers[0].vine})"
-    values = [factor * number.value for number in numbers]
-    return f"{min(values):+.2g} to {max(values):+.2g} {unit}"
 
 
 # ------------------------------------------------------------------------------
@@ -571,18 +545,15 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
 
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
-    names = joined([trial.name for trial in odd])
-    single = len(odd) == 1
     pressures = [
-        f"{'it' if single else trial.name} moves as at {trial.implied_pressure_Pa / 1e3:.3g} kPa, but"
-        f" {trial.stated_Pa / 1e3:.3g} kPa is stated"
+        f" {trial.name} moves as at {trial.implied_pressure_Pa / 1e3:.3g} kPa, but {trial.stated_Pa / 1e3:.3g} kPa is"
+        " stated."
         for trial in odd
         if trial.implied_pressure_Pa > 0
     ]
     return (
-        f"{names} {'is' if single else 'are'} inconsistent with the other {count - len(odd)} trials"
-        f"{': ' if pressures else ''}{'; '.join(pressures)}. Check {'its row' if single else 'their rows'} in the "
-        f"sheet and {'its recording' if single else 'their recordings'}; `use: no` leaves a trial out."
+        f"{joined([trial.name for trial in odd])} {'is' if len(odd) == 1 else 'are'} inconsistent with the other"
+        f" {count - len(odd)} trials.{''.join(pressures)} Check sheet and recording; `use: no` leaves a trial out."
     )
 
 
@@ -592,5 +563,5 @@ def odd_deciding_in_words(
     """Return the explanation where the verdict rests on trials that are inconsistent with the others."""
     names = joined([trial.name for trial in odd])
     text = f"{odd_in_words(odd, count)} Without {names} the verdict is `{others.verdict}`: {others.explanation}"
-    rests = f" the verdict would rest on {'it' if len(odd) == 1 else 'them'} alone." if withdrawn else ""
+    rests = " the verdict would rest on these alone." if withdrawn else ""
     return f"{text} With {names}:{rests} {with_them}"
