@@ -195,7 +195,7 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way_and_it_fail
 def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = per_trial_estimates(found, B, align_trials(found))
+    values = per_trial_estimates(found, align_trials(found))
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
     away = np.log(values.base / true) + values.deviation
@@ -211,11 +211,6 @@ def test_vines_of_different_exponents_are_told():
     one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
     fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
     assert {told.code for told in selection.contradictions((fit,), (), None)} == {"still_drifts"}
-    found = drift(fit)
-    row = found.table[found.table["parameter"] == "eversion_damping.n"].iloc[0]
-    assert row["significant"]
-    values = found.groups[found.groups["parameter"] == "eversion_damping.n"]["value"]
-    assert np.ptp(values) == pytest.approx(0.07, abs=0.03)
 
 
 @pytest.mark.slow

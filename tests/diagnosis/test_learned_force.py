@@ -231,7 +231,7 @@ def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:
     found, lengths = smooth.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
     weights = {domain.name: 1.0}
     return learning.LearnedForce(
-        domain, found, learning.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, 0.0, True
+        domain, found, learning.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, True
     )
 
 

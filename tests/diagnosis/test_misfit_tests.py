@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import grown as campaigns
 import numpy as np
@@ -20,7 +19,6 @@ from vinetrack.diagnosis import candidate_fits, ladder, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis import score_test as score_test
 from vinetrack.diagnosis.selection import slack_fit
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference import robust_covariance
@@ -140,19 +138,6 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
         mean, sd, limit = selection.size_not_excluded(estimate, 0.02, parameter)
         assert (mean, sd) == pytest.approx((estimate / 0.02**2 / precision, precision**-0.5), rel=1e-6)
         assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
-
-
-def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(monkeypatch):
-    """Usually they are past the end of growth."""
-    fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)
-    before = score_test.fit_columns(fit)
-    cannot = Mock(side_effect=SimulationError("Trial t: the model could not be integrated beyond 3.7 s."))
-    monkeypatch.setattr(fit.predictor, "linearise", cannot)
-    for known, fresh in zip(score_test.fit_columns(replace(fit)), before, strict=True):
-        assert np.allclose(known[:, -1], fresh[:, -1], atol=1e-12)
-        # Where growth ends a step changes more than a derivative says.
-        usual = np.median(np.abs(known - fresh), axis=0)
-        assert np.all(usual <= 0.02 * np.max(np.abs(fresh), axis=0))
 
 
 WANDER_M, B = 2e-4, "eversion_damping.B"

@@ -263,31 +263,6 @@ def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_
     assert family.threshold("effect_12") > family.threshold("effect_1") + 0.4
 
 
-@pytest.mark.parametrize(("bound", "adapting"), [(math.nan, [0, 1]), (0.0, [0])])
-def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_adapt(monkeypatch, bound, adapting):
-    n = 60
-    columns = np.random.default_rng(5).standard_normal((n, 4))  # two parameters, the residual, one effect
-    columns[:, 2] += 3 * columns[:, 1] + 0.5 * columns[:, 3]
-    blocks = (columns.T @ columns)[None]
-    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda _, state: blocks / state.variance[0])
-    arrays = {"index": [[0, 1]], "places": [[0, 1]], "places_of_pairs": [0, 1, 3, 4], "points": [float(n)]}
-    arrays |= {"prior_mean": np.zeros(2), "prior_precision": np.zeros(2), "free": [True, True]}
-    problem = SimpleNamespace(**{name: np.array(values) for name, values in arrays.items()})
-    state = marginal_likelihood.FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
-    numbers = [SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)]
-    fit = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
-    products = SimpleNamespace(parts=[np.array([0])], problem=problem, n_unknowns=2, n_shapes=1)
-    gain, size = score_test.linear_gains(fit, products, 0.0)
-
-    def squares(of: list[int]) -> tuple[float, float]:
-        found = np.linalg.lstsq(columns[:, of], columns[:, 2], rcond=None)
-        return float(found[1][0]), float(found[0][-1])
-
-    without, (with_effect, expected_size) = squares(adapting)[0], squares([*adapting, 3])
-    assert gain[0] == pytest.approx(n * math.log(without / with_effect), rel=1e-6)
-    assert size[0] == pytest.approx(expected_size, rel=1e-6)
-
-
 GAUGE = {"g.delta": Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))}
 
 

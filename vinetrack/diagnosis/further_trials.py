@@ -281,11 +281,6 @@ class DesignInformation:
         """Information from these trials and those so far."""
         return float(self.of(self.total(chosen)[None])[0])
 
-    def _improved(self, chosen: list[int], allowed: NDArray[np.intp]) -> list[int]:
-        """The same number of groups, exchanged."""
-        now = self.of_design(chosen)
-        return exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))[0]
-
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
         """The fewest pairs that reach the wanted information, else the best `most`; and how many
         trials by effort.
@@ -312,7 +307,7 @@ class DesignInformation:
         return min(options.values(), key=cost, default=[]), reached
 
     def _smallest(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
-        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
+        """Pairs added one by one up to the wanted information, exchanged, and as many as are needed of these, the most
         informative first.
         """
         chosen: list[int] = []
@@ -323,15 +318,11 @@ class DesignInformation:
                 break
             chosen.append(int(allowed[int(np.argmax(values))]))
             now = float(np.max(values))
-        chosen = self._improved(chosen, allowed)
-        while len(chosen) > 1:
-            least = int(np.argmax(self.of(self.total(chosen) - self.each[chosen])))
-            fewer = self._improved(chosen[:least] + chosen[least + 1 :], allowed)
-            if self.of_design(fewer) < wanted:
-                break
-            chosen = fewer
-        order: list[int] = []
-        while chosen:
+        chosen, order = (
+            exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))[0],
+            list[int](),
+        )
+        while chosen and (not order or self.of_design(order) < wanted):
             gains_of = self.of(self.total(order) + self.each[chosen])
             order.append(chosen.pop(int(np.argmax(gains_of))))
         return order

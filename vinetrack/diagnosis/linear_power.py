@@ -110,8 +110,7 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
         if not sensitivities.shapes:
             return 1.0
         systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
-        # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
-        scores = scores_of(refit, products_of(refit, refit.solution.columns, sensitivities, systematics))
+        scores = scores_of(refit, products_of(refit, sensitivities, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,9 +39,9 @@ from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, Number
+from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.robust_covariance import robust_covariance
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -199,10 +199,11 @@ def _named(row: pd.Series, table: pd.DataFrame) -> dict[str, object]:
 # ------------------------------------------------------------------------------
 # Parameters that drift with a condition on which they should not depend.
 #
-# One B should describe a vine at every pressure and with every payload, one γ all trials. The best value is therefore
-# fitted to each trial, with all other parameters at their common values, by least squares of position with its release
-# free. Values that follow the pressure point to what is missing. Their scatter by chance is taken from replicates, not
-# from the between-trial standard deviations and noise of the fit, which a model that fails inflates.
+# One B should describe a vine at every pressure and with every payload. The best value is therefore fitted to each
+# trial, with all other parameters at their common values, by least squares of position with its release free: it takes
+# upon itself whatever a model lacks. Values that follow the pressure point to what is missing. Their scatter by chance
+# is taken from replicates, not from the between-trial standard deviations and noise of the fit, which a model that
+# fails inflates.
 #
 # The common parameters were fitted to the same trials and have absorbed part of the drift (n most of it, where B
 # follows the pressure): what is found is the remainder, and its z is too small rather than too large.
@@ -217,7 +218,7 @@ COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
 
 DRIFT_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
-    *("relative", "z", "z_constancy", "dof", "n_trials", "significant", "sentence"),
+    *("z", "z_constancy", "dof", "n_trials", "significant", "sentence"),
 )
 GROUP_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
@@ -242,7 +243,7 @@ class Drift:
 
 
 def drift(fit: Fit) -> Drift:
-    """Test every parameter for drift with pressure, payload, angle, chamber, inlet or along the growth."""
+    """Test B for drift with pressure, payload, angle, chamber, inlet or along the growth, and P_y against the sheet."""
     import pandas as pd
 
     tests = sorted(_tests(fit), key=lambda tested: tested.p)
@@ -250,7 +251,7 @@ def drift(fit: Fit) -> Drift:
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]
     return Drift(
-        pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool, "relative": bool}),
+        pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool}),
         pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
     )
 
@@ -278,23 +279,16 @@ class ConstancyTest:
 
 
 def _tests(fit: Fit) -> Iterator[ConstancyTest]:
-    aligned = align_trials(fit)
-    for key in fit.predictor.layout.keys:
-        if key in (YIELD_PRESSURE, EXPONENT):
-            continue
-        try:
-            estimates = per_trial_estimates(fit, key, aligned)
-        except SimulationError:
-            continue  # No trial can be simulated with another value
+    if DAMPING in fit.predictor.layout.keys:
+        estimates = per_trial_estimates(fit, align_trials(fit))
         for against in COVARIATES:
             yield from _against(estimates, against)
-        if key == DAMPING:
-            yield from _along_growth(fit, estimates)
+        yield from _along_growth(fit, estimates)
     yield from against_the_sheet(fit)
 
 
 def _tested(
-    parameter: FreeParameter | Number,
+    number: Number,
     vine: str,
     against: str,
     levels: tuple[float, float],
@@ -303,14 +297,13 @@ def _tested(
     dof: float,
     n_trials: int,
     groups: Sequence[dict[str, object]] = (),
-    relative: bool = False,
     **told: Any,
 ) -> ConstancyTest:
     """A test as a row of the table: levels from and to, the change between them and its standard error. `p` are the
     p-values of a steady change and, where it is asked, of any; `told` is what the sentence about it needs besides.
     """
-    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    numbers = (*levels, *change, relative, _normal_deviate(p[0]), _normal_deviate(p[-1]), dof, n_trials)
+    of_parameter = (number.key, vine, number.symbol, number.unit, against)
+    numbers = (*levels, *change, _normal_deviate(p[0]), _normal_deviate(p[-1]), dof, n_trials)
     row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
     sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
     return ConstancyTest({**row, "sentence": sentence}, min(1.0, len(p) * min(p)), groups)
@@ -324,59 +317,44 @@ def _normal_deviate(p: float) -> float:
 
 
 def _group(
-    parameter: FreeParameter | Number,
-    vine: str,
-    against: str,
-    level: float,
-    base: float,
-    deviation: tuple[float, float],
-    n_trials: int,
-    logarithmic: bool = False,
+    number: Number, vine: str, against: str, level: float, base: float, deviation: float, sigma: float, n_trials: int
 ) -> dict[str, object]:
-    """A row of the table of groups: value and ratio to the common value `base`, each with its standard error, from the
-    deviation, of logarithms where so, and its standard error.
+    """A row of the table of groups: B and its ratio to the common value `base`, each with its standard error, from the
+    deviation of ln B and its standard error.
     """
-    change, sigma = deviation
-    if logarithmic:
-        ratio, ratio_sigma = math.exp(change), math.exp(change) * sigma
-        value, value_sigma = base * ratio, base * ratio_sigma
-    else:
-        value, value_sigma = base + change, sigma
-        ratio, ratio_sigma = (value / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
-    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    numbers = (level, value, value_sigma, ratio, ratio_sigma, n_trials)
+    ratio = math.exp(deviation)
+    of_parameter = (number.key, vine, number.symbol, number.unit, against)
+    numbers = (level, base * ratio, base * ratio * sigma, ratio, ratio * sigma, n_trials)
     return dict(zip(GROUP_COLUMNS, (*of_parameter, *numbers), strict=True))
 
 
 # ------------------------------------------------------------------------------
-# Best-fit value of one parameter for each trial, with all other parameters at their common values.
+# B of each trial, with all other parameters at their common values.
 
-MAX_DEVIATION = 3.0  # Largest deviation from the common value, of ln B or in units of the parameter's scale (chosen)
+MAX_DEVIATION = 3.0  # Largest deviation of ln B from the common value (chosen)
 
 
 @dataclass(frozen=True)
 class PerTrialEstimates:
-    """Estimates of one parameter by trial; arrays of shape (n_trials,), SI, NaN where a trial does not depend on it.
-    `base` is the common value, `deviation` the difference of the best fit of the trial from it, of logarithms where the
-    parameter is `logarithmic`; `variance` is that from a typical scatter of pressure and B, up to a factor. At the best
-    fit, `trial_effects` have shape (n_trials, 4), and `columns` are the sensitivities, `nuisances` those of release and
-    origin among them.
+    """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `base` the common value, `deviation` that
+    of the best ln B of the trial from it, NaN where a trial does not depend on it; `variance` is that from a typical
+    scatter of pressure and B, up to a factor. At the best fit, `trial_effects` have shape (n_trials, 4), and `columns`
+    are the sensitivities, `nuisances` those of release and origin among them.
     """
 
-    number: FreeParameter
-    per_vine: bool
+    number: Number
     trials: tuple[Trial, ...]
     base: Floats
     deviation: Floats
     variance: Floats
     trial_effects: Floats
-    columns: list[Floats]
+    columns: Sequence[Floats]
     nuisances: list[list[int]]
 
     @property
     def vines(self) -> NDArray[np.str_]:
-        """Names of the vines of the trials."""
-        return np.array([trial.vine for trial in self.trials])
+        """Names of the vines of the trials; blank where all have one B."""
+        return np.array([trial.vine if self.number.vine else "" for trial in self.trials])
 
     @property
     def conditions(self) -> NDArray[np.str_]:
@@ -384,33 +362,29 @@ class PerTrialEstimates:
         return np.array([trial.condition for trial in self.trials])
 
 
-def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:
-    """Fit the value of `key` to each trial by least squares of position, with its release free."""
-    data, common = aligned.predictor.data, fit.predictor.layout
-    place = common.index[:, common.keys.index(key)]
-    numbers = tuple(common.free[k] for k in place)
-    index = np.where(place >= 0, np.arange(len(data)), -1)[:, None]
-    layout = replace(aligned.predictor.layout, free=numbers, keys=(key,), index=index)
-    predictor = Predictor(layout, data, fit.predictor.host)
-    predictor.has_pressure_deviation[:] = False
-    base = layout.base[:, fit.model.parameter_names.index(key)]
-    start = np.array([number.to_scaled(value) for number, value in zip(numbers, base.tolist(), strict=True)])
-    theta, trial_effects = start.copy(), aligned.trial_effects.copy()
+def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
+    """Fit B to each trial by least squares of position, with its release free."""
+    predictor, data = aligned.predictor, aligned.predictor.data
     nuisances = [aligned.nuisances(i) for i in range(len(data))]
-    columns = predictor.linearise(theta, trial_effects)
-    # 5: Gauss–Newton steps (chosen)
-    for _ in range(5):
-        for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
-            step = np.linalg.lstsq(of_trial[:, [N_TRIAL_EFFECTS, *others]], of_trial[:, -1], rcond=1e-9)[0]
-            # 0.3, 2.0: largest step of ln B or in units of a parameter's scale, and of the release, frames (chosen)
-            theta[i] += np.clip(step[0], -0.3, 0.3)
-            trial_effects[i, RELEASE] += np.clip(step[1], -2.0 * data[i].frame_s, 2.0 * data[i].frame_s)
-            trial_effects[i, ORIGIN] += step[2] if len(step) > 2 else 0.0
-        theta = np.clip(theta, start - MAX_DEVIATION, start + MAX_DEVIATION)
-        columns = predictor.linearise(theta, trial_effects)
+    trial_effects, columns = aligned.trial_effects.copy(), aligned.columns
+    # 0.3, 2.0: largest step of ln B, and of the release, frames (chosen)
+    limits = {DAMPING_DEVIATION: 0.3, ORIGIN: math.inf}
+    try:
+        # 5: Gauss–Newton steps (chosen)
+        for _ in range(5):
+            for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
+                free = [DAMPING_DEVIATION, *others]
+                most = [limits.get(place, 2.0 * data[i].frame_s) for place in free]
+                step = np.linalg.lstsq(of_trial[:, free], of_trial[:, -1], rcond=1e-9)[0]
+                trial_effects[i, free] += np.clip(step, np.negative(most), most)
+            of_B = trial_effects[:, DAMPING_DEVIATION]
+            trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
+            columns = tuple(predictor.linearise(np.empty(0), trial_effects))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated: {error}") from error
     response, variance = np.empty(len(data)), np.empty(len(data))
     for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
-        sensitivity = orthogonal_part(of_trial[:, N_TRIAL_EFFECTS], of_trial[:, others])
+        sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])
         response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
         deviations = aligned.columns[i][:, [PRESSURE, DAMPING_DEVIATION]]
         levers = sensitivity @ orthogonal_part(deviations, aligned.columns[i][:, others]) / response[i]
@@ -418,17 +392,13 @@ def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialE
         scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
         variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
-    known &= np.abs(theta - start) < 0.99 * MAX_DEVIATION
-    scale = np.array([1.0 if number.logarithmic else number.scale for number in numbers])
-    if key == DAMPING:
-        trial_effects[:, DAMPING_DEVIATION] = theta - start
+    known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
     return PerTrialEstimates(
-        number=numbers[0],
-        per_vine=any(number.key == key and number.vine for number in fit.numbers),
+        number=next(number for number in fit.numbers if number.key == DAMPING),
         trials=tuple(trial_data.trial for trial_data in data),
-        base=base,
-        deviation=np.where(known, (theta - start) * scale, np.nan),
-        variance=variance * scale**2,
+        base=predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
+        deviation=np.where(known, trial_effects[:, DAMPING_DEVIATION], np.nan),
+        variance=variance,
         trial_effects=trial_effects,
         columns=columns,
         nuisances=nuisances,
@@ -436,18 +406,16 @@ def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialE
 
 
 # ------------------------------------------------------------------------------
-# Tests of whether per-trial estimates of a parameter vary with a condition: linear trend and differences.
+# Tests of whether B of single trials varies with a condition: linear trend and differences.
 
 
 def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTest]:
-    """Tests of one parameter against one condition: each vine alone where the parameter is per vine, and all."""
+    """Tests against one condition: of each vine alone, and of all."""
     levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
     usable, vines = np.isfinite(levels) & np.isfinite(estimates.deviation), estimates.vines
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    choices = [("", usable)]
-    if estimates.per_vine:
-        choices = [(vine, usable & (vines == vine)) for vine in varying]
-        choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
+    choices = [(vine, usable & (vines == vine)) for vine in varying]
+    choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
     for vine, chosen in choices:
         test = _trend(estimates, against, levels, vine, chosen)
         if test is not None:
@@ -465,7 +433,7 @@ def _trend(
 
     linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
     coordinate = levels if linear else np.log(levels)
-    weight, blocks = 1 / estimates.variance, estimates.vines if estimates.per_vine else np.full(levels.size, "")
+    weight, blocks = 1 / estimates.variance, estimates.vines
     w, block, level = weight[chosen], blocks[chosen], levels[chosen]
     x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
     square = float(np.sum(w * x**2))
@@ -489,15 +457,10 @@ def _trend(
     low, high = float(level.min()), float(level.max())
     ends = (low, high) if slope >= 0 else (high, low)
     reach = float(np.ptp(coordinate[chosen]))
-    change, error = abs(slope) * reach, sigma * reach
-    if estimates.number.logarithmic:
-        change, error = math.expm1(change), math.exp(change) * error
-    shown = not estimates.per_vine or vine
-    groups = _groups(estimates, against, levels, vine, chosen, variance) if shown else ()
-    number, sizes = estimates.number, (change, error)
-    return _tested(
-        number, vine, against, ends, sizes, (p, p_constancy), dof, d.size, groups, relative=number.logarithmic
-    )
+    change = math.expm1(abs(slope) * reach), math.exp(abs(slope) * reach) * sigma * reach
+    alone = len(set(block.tolist())) == 1
+    groups = _groups(estimates, against, levels, vine, chosen, variance) if alone else ()
+    return _tested(estimates.number, vine, against, ends, change, (p, p_constancy), dof, d.size, groups)
 
 
 def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
@@ -529,8 +492,7 @@ def _groups(
         w, bases = 1 / estimates.variance[k], estimates.base[k]
         base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
         mean, sigma = float(np.average(estimates.deviation[k], weights=w)), math.sqrt(variance / float(np.sum(w)))
-        number = estimates.number
-        rows.append(_group(number, vine, against, level, base, (mean, sigma), k.size, number.logarithmic))
+        rows.append(_group(estimates.number, vine, against, level, base, mean, sigma, k.size))
     return rows
 
 
@@ -557,13 +519,13 @@ def _along_growth(fit: Fit, estimates: PerTrialEstimates) -> Iterator[ConstancyT
         mean, sigma = float(rise.mean()), max(math.sqrt(variance), 2e-3) / math.sqrt(rise.size)
         base = float(estimates.base[chosen[0]])
         groups = [
-            _group(estimates.number, vine, "growth", level, base, (half, sigma / math.sqrt(2)), rise.size, True)
+            _group(estimates.number, vine, "growth", level, base, half, sigma / math.sqrt(2), rise.size)
             for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True)
         ]
         p = float(2 * student.sf(abs(mean) / sigma, dof))
         change, levels = (math.expm1(abs(mean)), math.exp(abs(mean)) * sigma), HALVES if mean >= 0 else HALVES[::-1]
-        shown = groups if vine else ()
-        yield _tested(estimates.number, vine, "growth", levels, change, (p,), dof, rise.size, shown, relative=True)
+        shown = groups if vine or len(names) == 1 else ()
+        yield _tested(estimates.number, vine, "growth", levels, change, (p,), dof, rise.size, shown)
 
 
 def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
@@ -573,7 +535,7 @@ def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
     """
     halves = np.full((len(estimates.trials), 2), math.nan)
     for i, (trial_data, columns) in enumerate(zip(fit.predictor.data, estimates.columns, strict=True)):
-        response, speed, residual = columns[:, N_TRIAL_EFFECTS], -columns[:, RELEASE], columns[:, -1]
+        response, speed, residual = columns[:, DAMPING_DEVIATION], -columns[:, RELEASE], columns[:, -1]
         growth = trial_data.lead_position_m - residual - estimates.trial_effects[i, ORIGIN]
         middle = int(np.argmax(growth >= 0.5 * growth.max()))
         if speed[middle] > 0 and response[middle] != 0:

@@ -24,8 +24,6 @@ from vinetrack.diagnosis.score_test import (
     Scores,
     effect_sensitivities,
     family_test,
-    fit_columns,
-    linear_gains,
     plausible_range,
     products_of,
     scores_of,
@@ -34,7 +32,7 @@ from vinetrack.diagnosis.score_test import (
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, relative_residual, track_correlation, variance_floor
+from vinetrack.inference.optimiser import is_poor_fit, relative_residual, variance_floor
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, Systematics, cluster_variance, systematics_of
 
 # ------------------------------------------------------------------------------
@@ -81,14 +79,14 @@ class Structure:
     smallest_probe_p: float = 1.0
 
 
-def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
+def structure_of(fit: Fit, systematics: Systematics) -> Structure:
     """Test a fit for misfit that a smooth force could explain. The scores of all probes are tested together, with both
     kinds of error, in the directions that the fitted parameters leave to them.
     """
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    return structure_from_scores(scores_of(fit, products_of(fit, columns, answers, systematics)))
+    return structure_from_scores(scores_of(fit, products_of(fit, answers, systematics)))
 
 
 def structure_from_scores(scores: Scores) -> Structure:
@@ -357,11 +355,6 @@ class MisfitTests:
         return all_probes or self.structure.smallest_probe_p < min(SINGLE_PROBE_LEVEL, self.level)
 
     @property
-    def far_off(self) -> bool:
-        """Whether the misfit exceeds any noise."""
-        return self.fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF
-
-    @property
     def exceeds_slow_errors(self) -> bool:
         """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
         return exceeds_slow_errors(self.fit)
@@ -374,8 +367,6 @@ class MisfitTests:
     @cached_property
     def predicted_gains(self) -> tuple[Floats, Floats]:
         """Predicted fall of −2 ln L with each shape, and the size it is predicted at (linear)."""
-        if self.far_off:
-            return linear_gains(self.fit, self.products, track_correlation(self.fit.predictor.data))
         signs, size = np.array(self.signs), self.scores.size
         sign_allowed = (signs == 0) | (size * signs > 0)
         return np.where(sign_allowed, self.scores.score * size, 0.0), size
@@ -462,7 +453,6 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
-    columns = fit_columns(fit)
-    products = products_of(fit, columns, sensitivities, systematics)
-    structure = structure_of(fit, columns, systematics)
+    products = products_of(fit, sensitivities, systematics)
+    structure = structure_of(fit, systematics)
     return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), structure, level)

@@ -217,17 +217,14 @@ def _least_chi2(choices: Sequence[Choice]) -> float:
     return min(choice.least_chi2 for choice in choices)
 
 
-def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float, begins: str = "") -> Posterior:
-    """The posterior of the coefficients over a domain, their noise variance inflated; `begins`, of forces that are this
-    where growth begins.
-    """
-    hypotheses = [each for each in domain.hypotheses if begins in ("", each[0])]
+def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float) -> Posterior:
+    """The posterior of the coefficients over a domain, their noise variance inflated."""
     return posterior(
         equations.information / inflation,
         (equations.score + equations.information @ equations.coefficients) / inflation,
-        [domain.modes(*each) for each in hypotheses],
+        [domain.modes(*each) for each in domain.hypotheses],
         amplitudes_N(equations.point.motions),
-        [LOG_ODDS[at_start] for at_start, _ in hypotheses],
+        [LOG_ODDS[at_start] for at_start, _ in domain.hypotheses],
     )
 
 
@@ -258,7 +255,6 @@ class LearnedForce:
     not_excluded: tuple[str, ...]
     log_bayes_factor: float
     explained: float
-    undecided_N: float
     is_repeated: bool
 
     def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -314,7 +310,6 @@ class LearnedForce:
             begins=self.at_start if self.domain.start_axis >= 0 else "",
             range_N=(float(force_N.min()), float(force_N.max())),
             sigma_N=float(self.visited["sigma_N"].median()),
-            undecided_N=self.undecided_N,
             explained=self.explained,
             is_repeated=self.is_repeated,
             has_pressures=any("pressure" in name for name in self.weights),
@@ -331,7 +326,6 @@ class LearnedForce:
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
             "begins": self.at_start,
-            "undecided_N": self.undecided_N,
             "sentence": str(self.sentence),
         }
 
@@ -378,7 +372,6 @@ def learned_force(problem: ForceProblem, on_tracks: Sequence[Choice], choices: S
         not_excluded=tuple(others),
         log_bayes_factor=log_bayes_factors[domain.name],
         explained=min(explained, 1.0),
-        undecided_N=_undecided_N(best, inflation),
         is_repeated=bool(problem.scatter.dof),
     )
 
@@ -395,19 +388,6 @@ def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
         return settled(choice.equations, lambda each: coefficients_of(choice.domain, each, inflation).mean)
 
     return min((settle(choice) for choice in likely.values()), key=lambda found: found[0])[1]
-
-
-def _undecided_N(choice: Choice, inflation: float) -> float:
-    """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and P_y
-    compete with such a force.
-    """
-    domain = choice.domain
-    if domain.start_axis < 0 or len(domain.variables) < 2:
-        return 0.0
-    at = [np.linspace(low, high, 30) for low, high in zip(domain.low, domain.high, strict=True)]
-    at[domain.start_axis] = np.full(30, domain.low[domain.start_axis])
-    free = coefficients_of(domain, choice.equations, inflation, FREE_AT_START)
-    return float(np.median(standard_error(domain.basis(at), free.covariance)))
 
 
 # ------------------------------------------------------------------------------

@@ -374,25 +374,11 @@ class Products:
         return all_products(self.columns[part], first, relative)
 
 
-def fit_columns(fit: Fit) -> list[Floats]:
-    """Columns of a fit's trial effects, parameters and residual, with the same derivatives as those of the candidates.
-    Shape (n_points, 4 + n_keys + 1).
-    """
-    state = fit.solution.state
-    try:
-        return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
-    except SimulationError:
-        # A vine that sticks may fail to simulate with another finite-difference step: use the last columns of the fit.
-        return list(fit.solution.columns)
-
-
-def products_of(
-    fit: Fit, columns: Sequence[Floats], sensitivities: EffectSensitivities, systematics: Systematics
-) -> Products:
+def products_of(fit: Fit, sensitivities: EffectSensitivities, systematics: Systematics) -> Products:
     """Assemble the columns of a fit, of its systematic errors and of the candidates. Afterwards the columns of
     `sensitivities` are views of those made here, so that no trial's are held twice.
     """
-    of_fit, problem = systematics.added_to(columns, fit.solution.problem)
+    of_fit, problem = systematics.added_to(fit.solution.columns, fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):
         assembled.append(np.column_stack([columns_of_trial, sensitivities.columns[i]]))
@@ -570,37 +556,6 @@ def _adapting(fit: Fit, problem: MixedProblem, hessian: Floats) -> NDArray[np.in
     at_bound = np.zeros(len(hessian), dtype=bool)
     at_bound[: len(fit.numbers)] = [math.isfinite(number.bound) for number in fit.numbers]
     return np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~at_bound)
-
-
-def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floats]:
-    """Predicted fall of −2 ln L with each shape, and the size at which it is reached, in the linear model. The noise
-    has the correlation of the tracks' noise and one variance for all trials, estimated from the residuals: where a
-    model is far off, the noise of its fit has absorbed part of the misfit. Returns gain, size : arrays, shape
-    (n_shapes,).
-    """
-    state = fit.solution.state
-    total = fit.solution.problem.points.sum()
-    variance = state.variance
-    for _ in range(4):
-        trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
-        projection = projected(fit, products, trial_state)
-        score, information = projection.score, np.diag(projection.information)
-        residual_sum = _residual_sum(products, projection, trial_state)
-        variance = np.full_like(variance, float(np.mean(variance)) * max(residual_sum / total, 1e-6))
-    size = np.where(information > 0, score / np.maximum(information, 1e-300), 0.0)
-    reduced_sum = np.maximum(residual_sum - score * size, 1e-3 * residual_sum)
-    return np.asarray(total * np.log(residual_sum / reduced_sum)), size
-
-
-def _residual_sum(products: Products, projection: Projection, state: FitState) -> float:
-    """Residual sum of squares, in units of the noise, with the fit's unknowns at their best; priors included. Those at
-    a bound, or fixed, stay where they are, as in `projected`: their steps there are 0.
-    """
-    problem, blocks, p = products.problem, projection.blocks, products.n_unknowns
-    deviation = _deviation(problem, state)
-    gradient = sum_vector_blocks(blocks[:, :p, p], problem) - problem.prior_precision * deviation
-    total = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * deviation**2))
-    return max(float(total - projection.step @ gradient), 1e-9 * float(total))
 
 
 # ------------------------------------------------------------------------------

@@ -480,15 +480,13 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     only_suspected = not tests.rejects_model and not stated_difference
     if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
         return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
-    rounds = None if _may_be_improved(hypotheses) else _single_effect_rounds(tests, search, hypotheses)
-    if rounds is not None:
-        return rounds
-
-    # All single effects: linear predictions rank candidates well near the truth, not far from it.
-    hypotheses = [*search.fit(all_of_them=True), *alone]
-    rounds = _single_effect_rounds(tests, search, hypotheses)
-    if rounds is not None:
-        return rounds
+    # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
+    # from it.
+    for every in (False, True):
+        hypotheses = [*search.fit(all_of_them=every), *alone]
+        rounds = _single_effect_rounds(tests, search, hypotheses) if every or not _may_be_improved(hypotheses) else None
+        if rounds is not None:
+            return rounds
     if not tests.rejects_model and not tests.needs_search:
         return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
 

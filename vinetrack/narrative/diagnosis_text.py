@@ -508,15 +508,14 @@ def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: flo
     """Return how a parameter drifts: a row of the table, whether it rises steadily, the error of the sheet."""
     against, z, start, stop = (row[name] for name in ("against", "z", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
-    unit, factor = ("%", 100.0) if row["relative"] else display_unit(row["unit"])
     if against == "sheet":
         return (
             f"{who} is pulled from the {start / 1e3:.2f} ± {stated_sigma_Pa / 1e3:.2f} kPa of the sheet to"
             f" {stop / 1e3:.2f} kPa ({z:.1f} σ)."
         )
-    change, error = factor * row["change"], factor * row["change_sigma"]
+    change, error = 100 * row["change"], 100 * row["change_sigma"]
     digits = max(decimals(error) - 1, 0)
-    amount = f"{change:.{digits}f} ± {error:.{digits}f} {unit}".rstrip()
+    amount = f"{change:.{digits}f} ± {error:.{digits}f} %"
     if against == "growth":
         larger, smaller = ("second", "first") if stop > start else ("first", "second")
         return (
@@ -557,7 +556,6 @@ def learned_force_text(
     begins: str,
     range_N: tuple[float, float],
     sigma_N: float,
-    undecided_N: float,
     explained: float,
     is_repeated: bool,
     has_pressures: bool,
@@ -574,8 +572,7 @@ def learned_force_text(
         f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit."
     ).replace("-", "−")
     if begins:
-        size = f" (±{undecided_N:.2f} N)" if undecided_N else ""
-        text += f" Where growth begins it is {begins}: B, n and P_y could account for a part{size} that is constant."
+        text += f" Where growth begins it is {begins}: B, n and P_y could account for a part that is constant."
     else:
         text += " These trials do not decide how much of it belongs to B, n and P_y."
     if not is_repeated:
