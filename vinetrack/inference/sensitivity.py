@@ -295,9 +295,7 @@ class Predictor:
         edges = self.starts.tolist()
         return [values[a:b] for a, b in itertools.pairwise(edges)]
 
-    def linearise(
-        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
-    ) -> list[Floats]:
+    def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
         (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
@@ -310,19 +308,12 @@ class Predictor:
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
         table[:, -1] = self._residuals(rows[:, OBSERVED], trial_effects)
-        trajectories = motions.trajectories() if past_end else []
         first = count
         for place, steps, perturbed in perturbations:
             jobs, first = slice(first, first + len(perturbed)), first + len(perturbed)
             points = self._points_of(perturbed.trial)
-            if past_end:
-                pairs = zip(perturbed.trial, trajectories[jobs], strict=True)
-                change = np.concatenate(
-                    [position_change(trajectories[i], perturbed_trajectory) for i, perturbed_trajectory in pairs]
-                )
-            else:
-                change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
-                self._clip_after_end(change, motions, perturbed.trial, jobs)
+            change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
+            self._clip_after_end(change, motions, perturbed.trial, jobs)
             table[points, place] = change / np.repeat(steps, np.diff(self.starts)[perturbed.trial])
         if DAMPING in self.layout.keys:
             # The sensitivity to ln B of the vine is also that to the deviation of ln B.
@@ -338,7 +329,7 @@ class Predictor:
                     np.repeat(term.regressor[trials], np.diff(self.starts)[trials]),
                 )
                 table[points, N_TRIAL_EFFECTS + column] = term.scale * regressor * table[points, source]
-        if not (trial_effects_only or past_end):
+        if not trial_effects_only:
             # Steps for the next call, by how far these moved the trajectories.
             responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
             self.steps = _adapted_steps(np.max(responses[:, N_TRIAL_EFFECTS:-1], axis=0, initial=0.0), self.steps)
