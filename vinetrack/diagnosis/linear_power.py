@@ -377,9 +377,11 @@ def error_inflation(tests: MisfitTests) -> Floats:
         Σ_s ν (ln f_s² + 1 / f_s²) + x² I(f_P, f_B) / I(1, 1)
 
     for an effect whose score x at the true standard deviations would be one of `SCORE_GRID`; 1 where they are not
-    estimated. Shape (n_scores, n_shapes).
+    estimated, or from hundreds of trials. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
+    if len(tests.products.parts) > 1:
+        return np.ones((SCORE_GRID.size, len(scores.score)))
     # Factors on the between-trial standard deviations at which the information is computed (chosen)
     factors = [(1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0) if free else (1.0,) for free in estimable(fit.solution.problem)]
     pairs = np.array(list(itertools.product(*factors)))

@@ -330,12 +330,12 @@ class LearnedForce:
         }
 
 
-def learned_force(problem: ForceProblem, on_tracks: Sequence[Choice], choices: Sequence[Choice]) -> LearnedForce | None:
-    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit; choices as
-    seen from the tracks, and from the motions under the best of these.
+def learned_force(
+    problem: ForceProblem, choices: Sequence[Choice], misfit: float, log_bayes_factors: Mapping[str, float]
+) -> LearnedForce | None:
+    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit: χ² beyond
+    the number of points, as the evidence against no force, seen from the tracks.
     """
-    misfit = on_tracks[0].equations.chi2 - problem.n_points
-    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in on_tracks}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
     if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
         return None
@@ -518,13 +518,16 @@ def force_problem(fit: Fit) -> ForceProblem:
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
     problem = force_problem(fit)
-    choices, learned = choices_seen_from(problem, problem.fitted), None
+    choices, learned = list[Choice](), None
     with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
-        on_tracks = choices_seen_from(problem, problem.tracks)
-        under_force = choices_seen_from(problem, _under_best(problem, on_tracks))
-        # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
-        choices = min(choices, under_force, key=_least_chi2)
-        learned = learned_force(problem, on_tracks, under_force)
+        choices = choices_seen_from(problem, problem.tracks)
+        misfit = choices[0].equations.chi2 - problem.n_points
+        log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in choices}
+        choices = choices_seen_from(problem, _under_best(problem, choices))
+        learned = learned_force(problem, choices, misfit, log_bayes_factors)
+    # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
+    of_model = choices_seen_from(problem, problem.fitted)
+    choices = min(choices or of_model, of_model, key=_least_chi2)
     point, chi2 = choices[0].equations.point, choices[0].equations.chi2
     laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
     smooth = {choice.domain.name: choice.best.delta_chi2_beyond_chance for choice in choices}

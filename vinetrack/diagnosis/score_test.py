@@ -349,7 +349,7 @@ class Products:
     @cached_property
     def parts(self) -> list[slice]:
         """Slices of the trials whose cross products are held at once."""
-        trials_at_once = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
+        trials_at_once = 256  # Trials whose cross products are held at once, each of half a megabyte (chosen)
         return [slice(begin, begin + trials_at_once) for begin in range(0, len(self.columns), trials_at_once)]
 
     def cross_products(self, part: slice) -> Floats:
