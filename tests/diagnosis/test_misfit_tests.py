@@ -109,8 +109,8 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     by_effect = {one.effect: one for one in selection.confounders_of(after, ["inlet_loss"])}
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]
-    assert linear.value < linear.number.value < fold.value
     number = after.fit[INLET]
+    assert linear.value < number.value < fold.value
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
     assert selection.confounders_of(after, ["air_drag"]) == ()

@@ -17,7 +17,7 @@ from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference import fit_result, marginal_likelihood
 
 FIRST, LATER = misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests.FALSE_ALARM_LEVEL_LATER_ROUNDS
-QUIET = misfit_tests.Structure(0.0, 0, 1.0, 0.0)
+QUIET = misfit_tests.Structure()
 
 
 def summed(single: np.ndarray, informations: np.ndarray, groups=()) -> Scores:
@@ -106,7 +106,7 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     chance = {"between_conditions_p": 1.0, "noise_in_motion_p": 1.0}
     for name in chance:
         monkeypatch.setattr(misfit_tests, name, lambda _, name=name: chance[name])
-    shaped = misfit_tests.Structure(80.0, 8, 1e-9, 6.0)
+    shaped = misfit_tests.Structure(1e-9)
     assert not questioned(of).omnibus_rejects
     assert questioned(of, structure=shaped).omnibus_rejects
     for name in chance:

@@ -226,7 +226,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             largest=tests.upper_limits(effects[name])[0] if name in effects else {},
             along=single.others if in_answer_set else (),
             posterior_weight=weights[name],
-            confounded_by=tuple(each for each in step.confounded if each.number.key.split(".")[0] == name),
+            confounded_by=tuple(each for each in step.confounded if each.parameter.split(".")[0] == name),
             log_bayes=single.log_bayes,
         )
         rows.append(row)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,17 +66,12 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     return shapes
 
 
-@dataclass(frozen=True)
-class Structure:
-    """Result of the probes: χ² of their scores for `degrees` of freedom, its p-value `p`, and the same as a `z`.
-    `smallest_probe_p` is the smallest p-value of single probes, Bonferroni-corrected: a narrow feature shows in one
-    probe and is diluted in the sum over all.
+class Structure(NamedTuple):
+    """p-values of the probes: of all scores together, and the smallest of single probes, Bonferroni-corrected: a narrow
+    feature shows in one probe and is diluted in the sum over all.
     """
 
-    chi2: float
-    degrees: int
-    p: float
-    z: float
+    p: float = 1.0
     smallest_probe_p: float = 1.0
 
 
@@ -85,14 +81,14 @@ def structure_of(fit: Fit, systematics: Systematics) -> Structure:
     """
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
-        return Structure(0.0, 0, 1.0, 0.0)
+        return Structure()
     return structure_from_scores(scores_of(fit, products_of(fit, answers, systematics)))
 
 
 def structure_from_scores(scores: Scores) -> Structure:
     """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`."""
     from scipy.stats import f as fisher
-    from scipy.stats import norm, t
+    from scipy.stats import t
 
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
     informative = np.diag(scores.information) > 0
@@ -119,7 +115,7 @@ def structure_from_scores(scores: Scores) -> Structure:
     probe_degrees = noise_degrees if few else np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0))
     p_values = 2 * t.sf(np.abs(scores.z[informative]), probe_degrees)
     smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
-    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), smallest_probe_p)
+    return Structure(p, smallest_probe_p)
 
 
 # ------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
@@ -32,9 +32,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Confounder(JsonRecord):
-    """Another effect that a fitted size may include."""
+    """Another effect that a fitted size, of this `parameter` and vine, may include. Left free, it would have the 95 %
+    interval from `low_95` to `high_95`.
+    """
 
-    number: Annotated[Number, Field(exclude=True)]
+    parameter: str
+    vine: str
     effect: str
     symbol: str
     unit: str
@@ -42,16 +45,6 @@ class Confounder(JsonRecord):
     value: Annotated[OrNaN, Field(alias="value_at_limit")]
     low_95: OrNaN
     high_95: OrNaN
-
-    @property
-    def shift(self) -> float:
-        """How far the size may be off."""
-        return abs(self.value - self.number.value)
-
-
-def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
-    """The 95 % interval of a size with each of these effects left free (hull). Returns low, high : SI."""
-    return min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
 
 
 ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
@@ -137,7 +130,7 @@ class Candidate(JsonRecord):
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: OrNaN = math.nan
-    confounded_by: Annotated[tuple[Confounder, ...], Field(exclude=True)] = ()
+    confounded_by: tuple[Confounder, ...] = ()
     log_bayes: OrNaN = math.nan
 
     def is_richer_form_of(self, name: str) -> bool:
@@ -146,21 +139,13 @@ class Candidate(JsonRecord):
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
-        confounders = [{"parameter": c.number.key, "vine": c.number.vine, **c.to_json()} for c in self.confounded_by]
         entry = super().to_json()
-        return {**entry, "reason": str(self.reason), "reason_code": entry["reason"], "confounded_by": confounders}
+        return {**entry, "reason": str(self.reason), "reason_code": entry["reason"]}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
         """Read an entry of `ranking`; absent keys take their defaults."""
-        read = super().from_json({**entry, "reason": entry.get("reason_code"), "confounded_by": ()})
-        number_of = {(number.key, number.vine): number for number in read.numbers}
-        confounders = tuple(
-            Confounder.from_json({**stored, "number": number_of[place]})
-            for stored in entry.get("confounded_by") or ()
-            if (place := (stored["parameter"], stored["vine"])) in number_of
-        )
-        return replace(read, confounded_by=confounders)
+        return super().from_json({**entry, "reason": entry.get("reason_code")})
 
 
 StoredCandidate = Annotated[Candidate, BeforeValidator(Candidate.from_json), PlainSerializer(Candidate.to_json)]

@@ -297,16 +297,16 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     chosen = []
     for number, lever in zip(after.fit.numbers, levers, strict=True):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
+            by_shift = sorted(_of_number(after, number, lever), key=lambda found: -found[0])
             # 1.0: shift, in standard errors of the size, from which a confounder is reported (chosen)
-            relevant = [each for each in _of_number(after, number, lever) if each.shift > 1.0 * number.sigma]
             # 3: confounders listed for each size (chosen)
-            chosen += sorted(relevant, key=lambda confounder: -confounder.shift)[:3]
+            chosen += [confounder for shift, confounder in by_shift if shift > 1.0 * number.sigma][:3]
     return tuple(chosen)
 
 
-def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
-    """Every physical effect as a confounder of one size, in the shape that shifts the size most."""
-    confounders: dict[str, Confounder] = {}
+def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[tuple[float, Confounder]]:
+    """Every physical effect as a confounder of one size, in the shape that shifts the size most, with the shift."""
+    largest: dict[str, tuple[float, Confounder]] = {}
     for k, shape in enumerate(after.sensitivities.shapes):
         # An effect that contains the added one as a limit is an alternative to it, no confounder.
         effect, sigma = shape.effect, float(after.scores.sigma[k])
@@ -314,9 +314,10 @@ def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confou
         if alternative or not effect.parameters or shape.whole or not math.isfinite(sigma):
             continue
         confounder = _in_shape(number, shape, float(after.scores.size[k]), sigma, float(lever[k]))
-        if effect.name not in confounders or confounder.shift > confounders[effect.name].shift:
-            confounders[effect.name] = confounder
-    return list(confounders.values())
+        shift = abs(confounder.value - number.value)
+        if effect.name not in largest or shift > largest[effect.name][0]:
+            largest[effect.name] = shift, confounder
+    return list(largest.values())
 
 
 def _in_shape(number: Number, shape: CandidateShape, size: float, sigma: float, lever: float) -> Confounder:
@@ -325,7 +326,8 @@ def _in_shape(number: Number, shape: CandidateShape, size: float, sigma: float, 
     expected, quantile = number.value - lever * mean, 0.5 * (number.high - number.low) / number.sigma
     half_width = max(quantile if math.isfinite(quantile) else 0.0, TWO_SIDED_95) * math.hypot(number.sigma, lever * sd)
     return Confounder(
-        number=number,
+        parameter=number.key,
+        vine=number.vine,
         effect=shape.effect.name,
         symbol=shape.size.symbol,
         unit=shape.size.unit,

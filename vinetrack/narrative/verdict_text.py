@@ -26,7 +26,6 @@ from vinetrack.diagnosis.result import (
     SPECIMEN,
     UNEXPLAINED,
     Confounder,
-    left_open,
 )
 from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
@@ -218,7 +217,7 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     """Sizes of what was added, else of the members of the answer set."""
     if diagnosis.effects:
         added = [p for p in diagnosis.parameters if p.key.split(".")[0] in diagnosis.effects]
-        wider = [f"{interval_text(p)}{_confounded_interval(diagnosis, p.key)}" for p in added]
+        wider = [f"{interval_text(p)}{_confounded_interval(diagnosis, p)}" for p in added]
         return ", ".join(map(split_estimate, added)), "; ".join([*wider, *_shared_remedies(added)])
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
     return "; ".join(f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]), ""
@@ -362,22 +361,21 @@ def estimates_text(row: Candidate) -> str:
     return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < 2.0 else text
 
 
-def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
-    """The wider interval of a size that allows for effects the data do not exclude; blank without any."""
+def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
+    """The wider interval of a size that allows for effects the data do not exclude (hull); blank without any."""
     alike: list[Confounder] = []
     for entry in diagnosis.rounds:
         rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
-        alike = [rival for rival in rivals if rival.number.key == key] or alike
+        alike = [rival for rival in rivals if rival.parameter == size.key] or alike
     if not alike:
         return ""
-    factor = display_unit(alike[0].number.unit)[1]
-    low, high = left_open(alike)
+    factor = display_unit(size.unit)[1]
+    low, high = min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
     names = []
     for rival in alike:
         unit, times = display_unit(rival.unit)
-        names.append(
-            f"{spaced_name(rival.effect)} ({rival.symbol} up to {number(rival.limit * times, 2)} {unit}".rstrip() + ")"
-        )
+        limit = f"{number(rival.limit * times, 2)} {unit}".rstrip()
+        names.append(f"{spaced_name(rival.effect)} ({rival.symbol} up to {limit})")
     return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
