@@ -221,9 +221,8 @@ _MODELS = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
 
 @figure("drift", "drift", "Parameters that change with a condition", data="drift")
 def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
-    """The best value of each parameter in groups of trials, relative to the common law, against a condition on
-    which it should not depend; bars are one standard error from the scatter of replicates. With a complete model
-    all are 1.
+    """The best B in groups of trials, relative to the common law, against a condition on which it should not depend;
+    bars are one standard error from the scatter of replicates. With a complete model all are 1.
     """
     known = drift[np.isfinite(drift["ratio"].astype(float))] if len(drift) else drift
     if not len(known):
