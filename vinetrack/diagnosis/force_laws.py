@@ -125,13 +125,12 @@ class LawForm:
         return np.asarray(eval(self._compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
 
 
-_FORCE, _FORCE_BY_M = ("F", "F", (1, 0, 0, 0)), ("k", "k", (1, -1, 0, 0))
+_FORCE = ("F", "F", (1, 0, 0, 0))
 _V_0, _V_1 = (("v_0", "v₀", "m/s"),), (("v_1", "v₁", "m/s"),)
 _BY_BOTH, _BY_PRESSURE = ("speed", "pressure"), ("pressure",)
-_EDGE = f"({EDGE_FRACTION} * width)"
 FORMS = {
     "constant": LawForm("", _FORCE, "1.0", "F"),
-    "position": LawForm("growth", _FORCE_BY_M, "s.tail_position", "k x", times=_BY_BOTH),
+    "position": LawForm("growth", ("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x", times=_BY_BOTH),
     "speed": LawForm("speed", ("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE),
     "speed_squared": LawForm(
         "speed", ("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure")
@@ -140,7 +139,7 @@ FORMS = {
         "growth", ("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH
     ),
     "beyond_a_place": LawForm(
-        "growth", _FORCE_BY_M, "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
+        "growth", ("k", "k", (1, -1, 0, 0)), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
         (("y_0", "y₀", "m"),), _BY_BOTH,
     ),
     "speed_cubed": LawForm(
@@ -167,7 +166,8 @@ FORMS = {
     "patch": LawForm(
         "growth",
         _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / {_EDGE}) - np.tanh((s.lead_position - y_1 - width) / {_EDGE}))",
+        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
+        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
         f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
         (("y_1", "y₁", "m"), ("width", "w", "m")),
     ),

@@ -372,22 +372,17 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     return list(table(body, headings))
 
 
-def gain_in_words(before: Fit, after: Fit) -> str:
-    """Return the improvement by an added effect. The model with the effect contains the one without it, so a loss shows
-    that the optimiser has not converged.
-    """
-    gain = 2 * (after.log_likelihood - before.log_likelihood)
-    # 9.0: Δχ² above which an added effect is said to help (derived)
-    helps = f"Δχ² = {gain:.1f}{'' if gain > 9.0 else ', no significant improvement'}"
-    return helps if after.converged and gain >= 0 else f"{helps}; the fit did not converge"
-
-
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
     """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables."""
     from vinetrack.core.terminal import table as aligned
 
+    # The model with the effect contains the one without it: a loss shows that the optimiser has not converged.
+    gain = 2 * (after.log_likelihood - before.log_likelihood)
+    # 9.0: Δχ² above which an added effect is said to help (derived)
+    helps = f"Δχ² = {gain:.1f}{'' if gain > 9.0 else ', no significant improvement'}"
+    helps += "" if after.converged and gain >= 0 else "; the fit did not converge"
     lines = [
-        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {gain_in_words(before, after)}",
+        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {helps}",
         "",
         "position error",
         *_ladder_table(table),
