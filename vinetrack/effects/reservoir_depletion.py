@@ -11,13 +11,13 @@ mm, 28 kPa falls by 15 % (γ = 1, slow enough to stay at room temperature) to 21
 7 kPa by 51 to 71 %.
 
 V₀ includes hoses and all else that is open to the vine. An error of V₀ shows in γ, which is then that of the gas times
-the ratio of stated to true volume, as long as V₀ is much larger than the filled volume. A γ outside 1 to 1.4 is an
-error of V₀.
+the ratio of stated to true volume, as long as V₀ is much larger than the filled volume.
 
 Easily taken for `tail_friction` in the first half of growth (all along with a reel), or for a `leak` at constant speed.
 Another chamber or another diameter tells them apart.
 
-Reduce it with a larger chamber beside the inlet, or measure the pressure during growth and give it as a trace.
+Reduce it with a larger chamber beside the inlet, or measure the pressure during growth and give it as a trace. A γ
+outside 1 to 1.4 is an error of the stated volume: the true one is 1/γ to 1.4/γ times as large, hoses included.
 
 Source: the gas laws; Alvarez et al. (2025), section III-B, uses gauge pressure in P₂ = P₁V₁/V₂, which hides the effect.
 """
