@@ -318,10 +318,8 @@ class DesignInformation:
                 break
             chosen.append(int(allowed[int(np.argmax(values))]))
             now = float(np.max(values))
-        chosen, order = (
-            exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))[0],
-            list[int](),
-        )
+        chosen, _ = exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))
+        order: list[int] = []
         while chosen and (not order or self.of_design(order) < wanted):
             gains_of = self.of(self.total(order) + self.each[chosen])
             order.append(chosen.pop(int(np.argmax(gains_of))))

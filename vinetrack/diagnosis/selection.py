@@ -82,7 +82,6 @@ class EffectSets:
     def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio]) -> None:
         self.search = search
         self.before = search.tests.fit
-        self.effects = search.tests.effects
         self.fitted: dict[Names, LikelihoodRatio] = {}
         for single in singles:
             self._keep_best(single)
