@@ -128,7 +128,9 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
     note = table.attrs["notes"][0]
     assert (note.code, note.facts["left_out"], note.facts["count"]) == ("left_out_error_without", "conditions", 3)
     # The reader sees an error in sample of all trials beside one without them: a diagnosis says so.
-    told = diagnose._with_ladder(result.Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
+    told = diagnose._with_ladder(
+        result.Diagnosis(rounds=(result.Round(verdict="adequate"),), effects=(), explanation="", fits=(found,))
+    )
     assert told.notes == tuple(table.attrs["notes"])
 
 
