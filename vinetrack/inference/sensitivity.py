@@ -25,6 +25,7 @@ from vinetrack.dynamics.simulate import (
     Trajectory,
     bends_of,
     check_completed,
+    simulate_many,
     trajectories,
 )
 from vinetrack.effects import TrialInputs
@@ -529,7 +530,18 @@ def align(
         for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
     grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
-    trajectories = predictor.run(jobs, [grid_s + at_s for grid_s, at_s in zip(grids, jobs.release_s, strict=True)])
+    # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
+    trajectories = simulate_many(
+        predictor.layout.model,
+        [trial_data.trial for trial_data in data],
+        grids,
+        traces=[
+            None if trial_data.trace is None else (trial_data.trace[0] - release_s, trial_data.trace[1])
+            for trial_data, release_s in zip(data, jobs.release_s, strict=True)
+        ],
+        parameters=jobs.row,
+        host=predictor.host,
+    )
     best, misfit = trial_effects.copy(), np.zeros(len(data))
     for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
         if trial_data.pressurised_in_recording:

@@ -34,8 +34,7 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
                     options = {"preset": "veryfast", "crf": "26", "profile": "high", "tune": "animation"}
                     stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
                     context.thread_count = 1
-                    # 6 is the code of ITU-R BT.601 in the stream, by which OpenCV converts.
-                    context.colorspace = context.color_primaries = context.color_trc = 6
+                    context.colorspace = context.color_primaries = context.color_trc = 6  # BT.601, as OpenCV converts
                 planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
                 frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
                 frame.pts = count - 1
