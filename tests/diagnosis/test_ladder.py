@@ -213,6 +213,10 @@ def test_vines_of_different_exponents_are_told():
     one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
     fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
     assert {told.code for told in selection.contradictions((fit,), (), None)} == {"still_drifts"}
+    (of_n,) = (each for each in differences(fit) if each.name == "n_by_vine")
+    assert of_n.p < 1e-6
+    (split,) = between_fits(fit, [of_n], 0.0, lambda _: None)
+    assert np.ptp([number.value for number in split.numbers]) == pytest.approx(0.07, abs=0.03)
 
 
 @pytest.mark.slow

@@ -311,8 +311,11 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     from vinetrack.diagnosis.further_trials import next_experiment
 
     report("looking for the next experiment")
-    found = lambda: replace(result, next_experiment=next_experiment(tied, limits).to_json())  # noqa: E731
-    return _or_note(result, "no_next_experiment", found)
+    return _or_note(
+        result,
+        "no_next_experiment",
+        lambda: replace(result, next_experiment=next_experiment(tied, limits).to_json()),
+    )
 
 
 def _located(result: Diagnosis) -> Diagnosis:
