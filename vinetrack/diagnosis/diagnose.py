@@ -311,11 +311,8 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     from vinetrack.diagnosis.further_trials import next_experiment
 
     report("looking for the next experiment")
-    return _or_note(
-        result,
-        "no_next_experiment",
-        lambda: replace(result, next_experiment=next_experiment(tied, limits).to_json()),
-    )
+    advised = partial(next_experiment, tied, limits)
+    return _or_note(result, "no_next_experiment", lambda: replace(result, next_experiment=advised().to_json()))
 
 
 def _located(result: Diagnosis) -> Diagnosis:
