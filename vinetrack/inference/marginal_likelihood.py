@@ -47,49 +47,69 @@ def step_within_bounds(
     there while the others go on. Returns step, moving (parameters that do not end at a bound). Shapes: square (n, n);
     slope, below, above, free (n,).
     """
-    diagonal = np.diag(square)
-    moving = free & (diagonal > 0)
-    step, outward = np.zeros_like(slope), np.zeros_like(slope)
+    n, moving = slope.size, free.copy()
+    step, outward, left, remaining, lower = np.zeros(n), np.zeros(n), slope.copy(), np.zeros(n), np.empty((n, n))
+    for u in range(n):
+        moving[u] = free[u] and square[u, u] > 0
     # 10: bounds met or released per parameter, at most, in the search for the minimum within bounds (chosen)
-    for _ in range(10 * slope.size + 1):
-        k = np.flatnonzero(moving)
-        if k.size:
-            slope_left = slope - square @ np.where(moving, 0.0, step)
-            remaining = solve_scaled(square[k][:, k], slope_left[k]) - step[k]
-            # Go as far as the first bound, which lowers the sum of squares; fix those parameters, go on with the rest.
-            room = np.where(remaining > 0, above[k] - step[k], below[k] + step[k])
-            part = np.where(remaining == 0, np.inf, np.maximum(room, 0.0) / np.abs(remaining))
-            first = part.min()
-            step[k] += min(first, 1.0) * remaining
-            if first < 1:
-                met = part <= first
-                outward[k[met]] = np.sign(remaining[met])
-                moving[k[met]] = False
-                continue
-        # Decrease of the form if a parameter alone left its bound.
-        inward = np.where(moving, 0.0, np.maximum(-outward * (slope - square @ step), 0.0))
-        decrease = inward**2 / np.where(outward != 0, diagonal, 1.0)
+    for _ in range(10 * n + 1):
+        solve_moving(square, left, moving, lower, remaining)
+        # Go as far as the first bound, which lowers the sum of squares; fix that parameter, go on with the rest.
+        part, first = 1.0, -1
+        for u in range(n):
+            room = max(above[u] - step[u] if remaining[u] > 0 else below[u] + step[u], 0.0)
+            if room < part * abs(remaining[u]):
+                part, first = room / abs(remaining[u]), u
+        for u in range(n):
+            step[u] += part * remaining[u]
+        for u in range(n):
+            left[u] = slope[u]
+            for v in range(n):
+                left[u] -= square[u, v] * step[v]
+        if first >= 0:
+            moving[first], outward[first] = False, math.copysign(1.0, remaining[first])
+            continue
         # 1e-6: decrease of −2 ln L, by leaving its bound, from which a parameter is released (derived)
-        if not decrease.max() > 1e-6:
+        most = 1e-6
+        for u in range(n):
+            inward = 0.0 if moving[u] else max(-outward[u] * left[u], 0.0)
+            if inward**2 > most * square[u, u]:
+                most, first = inward**2 / square[u, u], u
+        if first < 0:
             break
-        moving[np.argmax(decrease)] = True
+        moving[first] = True
     return step, moving
 
 
 @njit(nogil=True, error_model="numpy")
-def solve_scaled(square: Floats, slope: Floats) -> Floats:
-    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular. Shapes: square (n, n);
-    slope (n,) → (n,).
+def solve_moving(square: Floats, slope: Floats, moving: NDArray[np.bool_], lower: Floats, solution: Floats) -> None:
+    """Solve a symmetric system, scaled to a unit diagonal, for the moving unknowns; the others, and those without
+    information of their own, stay 0. `lower` becomes its factor L D Lᵀ with D on the diagonal. Shapes: square, lower
+    (n, n); slope, moving, solution (n,).
     """
-    size = len(slope)
-    scale = 1 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-    scaled, lower = square * np.outer(scale, scale), np.empty((size, size))
-    _factor(scaled, lower)
-    # 1e-9: least pivot, the part of its information that a parameter keeps once the previous ones are eliminated, below
-    # which least squares drop what is singular (derived)
-    if np.diag(lower).min() > 1e-9:
-        return scale * _solved(lower, scale * slope)
-    return scale * np.linalg.lstsq(scaled, scale * slope, 1e-12)[0]
+    n, scale = slope.size, np.zeros(slope.size)
+    for u in range(n):
+        if moving[u]:
+            scale[u] = 1 / math.sqrt(square[u, u])
+        solution[u] = scale[u] * slope[u]
+        for v in range(u + 1):
+            left = scale[u] * square[u, v] * scale[v]
+            for w in range(v):
+                left -= lower[u, w] * lower[v, w] * lower[w, w]
+            lower[u, v] = left if u == v else left / lower[v, v]
+        # 1e-9: least pivot, the part of its information that an unknown keeps once the previous ones are eliminated
+        # (derived); 1e300: as if it were known
+        if not lower[u, u] > 1e-9:
+            lower[u, u] = 1e300
+        for v in range(u):
+            solution[u] -= lower[u, v] * solution[v]
+    for u in range(n):
+        solution[u] /= lower[u, u]
+    for u in range(n - 1, -1, -1):
+        for v in range(u + 1, n):
+            solution[u] -= lower[v, u] * solution[v]
+    for u in range(n):
+        solution[u] *= scale[u]
 
 
 @njit(nogil=True, error_model="numpy")
@@ -115,7 +135,6 @@ def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, fl
     return left, log_det
 
 
-@njit(nogil=True, error_model="numpy")
 def noise_at_correlations(
     cross_products: Floats,
     prior_precision: Floats,
@@ -130,55 +149,18 @@ def noise_at_correlations(
     squares, degrees (residual sums of squares and their degrees of freedom). Shapes: cross_products (n_trials, 3, m +
     1, m + 1); prior_precision, prior_gradient (n_trials, m); points (n_trials,); rhos (n_rhos,) → (n_rhos,).
     """
-    trials, m = prior_precision.shape
-    scores = np.zeros(len(rhos))
-    squares, degrees = np.empty((len(rhos), trials)), np.empty((len(rhos), trials))
-    lower = np.empty((m, m))
-    for k in range(len(rhos)):
-        for i in range(trials):
-            lag_zero, lag_one, inner = cross_products[i, 0], cross_products[i, 1], cross_products[i, 2]
-            white = lag_zero - rhos[k] * lag_one + rhos[k] ** 2 * inner
-            gradient = white[:m, m] - prior_gradient[i]
-            scale = 1 / np.sqrt(np.diag(white)[:m] + prior_precision[i])
-            scaled = np.outer(scale, scale) * white[:m, :m]
-            information = scaled + np.diag(prior_precision[i] * scale**2 + RIDGE)
-            _factor(information, lower)
-            log_det, dof_taken = 0.0, shared
-            for u in range(m):
-                log_det += math.log(abs(lower[u, u])) - 2 * math.log(scale[u])
-                dof_taken += _solved(lower, scaled[u])[u]
-            dof = max(points[i] - dof_taken, 1.0)
-            explained = np.sum(scale * gradient * _solved(lower, scale * gradient))
-            residual_square = max(white[m, m] - explained, least_residual_part * white[m, m])
-            scores[k] += dof * math.log(residual_square / dof) + log_det
-            squares[k, i], degrees[k, i] = residual_square, dof
-    return scores, squares, degrees
-
-
-@njit(nogil=True, error_model="numpy")
-def _factor(matrix: Floats, lower: Floats) -> None:
-    """LDLᵀ factorisation of a symmetric matrix; D is the diagonal of `lower`."""
-    for u in range(len(matrix)):
-        for v in range(u + 1):
-            left = matrix[u, v]
-            for w in range(v):
-                left -= lower[u, w] * lower[v, w] * lower[w, w]
-            lower[u, v] = left if u == v else left / lower[v, v]
-
-
-@njit(nogil=True, error_model="numpy")
-def _solved(lower: Floats, right: Floats) -> Floats:
-    """The solution with the factors of `_factor`."""
-    size, solution = len(right), right.copy()
-    for u in range(size):
-        for v in range(u):
-            solution[u] -= lower[u, v] * solution[v]
-    for u in range(size):
-        solution[u] /= lower[u, u]
-    for u in range(size - 1, -1, -1):
-        for v in range(u + 1, size):
-            solution[u] -= lower[v, u] * solution[v]
-    return solution
+    m, rho = prior_precision.shape[1], rhos[:, None, None, None]
+    white = cross_products[:, 0] - rho * cross_products[:, 1] + rho**2 * cross_products[:, 2]
+    residual, gradient = white[..., m, m], white[..., :m, m] - prior_gradient
+    scale = 1 / np.sqrt(np.einsum("...kk->...k", white)[..., :m] + prior_precision)
+    prior = prior_precision * scale**2 + RIDGE
+    information = scale[..., :, None] * white[..., :m, :m] * scale[..., None, :] + prior[..., None] * np.eye(m)
+    inverse = np.linalg.inv(information)
+    log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
+    dof = np.maximum(points - shared - m + np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1), 1.0)
+    explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
+    squares = np.maximum(residual - explained, least_residual_part * residual)
+    return np.sum(dof * np.log(squares / dof) + log_det, axis=1), squares, dof
 
 
 LEAST_BETWEEN_TRIAL_SD = 1e-5  # Least between-trial standard deviation (chosen)
@@ -434,7 +416,6 @@ def bounded_solve(
     """`step_within_bounds` of the parameters of a problem. Shapes: square (n_free, n_free); slope, theta (n_free,)."""
     if not slope.size:
         return slope, problem.free
-    square = np.ascontiguousarray(square)  # numba warns of products with any other
     return step_within_bounds(square, slope, theta - problem.lower, problem.upper - theta, problem.free)
 
 
@@ -602,7 +583,7 @@ def estimate_noise(
     columns = [*range(n_freed), cross_products.shape[-1] - 1]
     # 1e-6, 0.2: least part of the residual sum of squares that remains (derived)
     scores, squares, degrees = noise_at_correlations(
-        np.ascontiguousarray(cross_products[:, :, columns][:, :, :, columns]),
+        cross_products[:, :, columns][:, :, :, columns],
         precision_scaled,
         prior_gradient,
         problem.points,

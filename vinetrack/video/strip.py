@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
-from vinetrack.core.threads import FEWEST_PICTURES, in_parts, njit
 from vinetrack.video.axis import Axis
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -281,70 +280,33 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
     """
     level = float(np.abs(basis[0]).mean()) + 1e-9
     ridge = np.diag([0.0, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
-    pixels = _pixels(luma, places, shift_px)
-    parts = in_parts(lambda first, last: _robust_fits(pixels[first:last], basis, ridge), len(pixels), FEWEST_PICTURES)
-    solution, sigma = (np.concatenate(part) for part in zip(*parts, strict=True))
+    solution, sigma = _robust_fits(_pixels(luma, places, shift_px), basis, ridge)
     solution[:, 2:] /= np.maximum(solution[:, :1], 0.05)
     return solution, sigma
 
 
-@njit(nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robust_fits(data: NDArray[Any], basis: Floats, ridge: Floats) -> tuple[Floats, Floats]:
     """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd). `data`
     has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
     standard errors of the last two, shape (n_frames, 2).
     """
-    median_every = 4  # Stride of the pixels used for medians (derived)
-    n, count = data.shape
-    out, error = np.zeros((n, 4)), np.full((n, 2), np.inf)
-    residuals, inlier = np.empty(count), np.ones(count)
-    normal_matrix, sampled_basis = basis @ basis.T + ridge, basis[0, ::median_every].copy()
-    # A sample of the pixels suffices for the median of the residuals.
-    reference_median = max(np.median(sampled_basis), 1e-9)
-    for t in range(n):
-        inlier[:] = 1.0
-        values = data[t]
-        for iteration in range(2):
-            r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
-            for k in range(count):
-                value = inlier[k] * values[k]
-                r0 += value * basis[0, k]
-                r1 += value * basis[1, k]
-                r2 += value * basis[2, k]
-                r3 += value * basis[3, k]
-            inverse = np.linalg.inv(normal_matrix if iteration == 0 else _masked_products(basis, inlier) + ridge)
-            a, b, c, d = inverse @ np.array([r0, r1, r2, r3])
-            for k in range(count):
-                residuals[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
-            scale = 1.4826 * np.median(residuals[::median_every][inlier[::median_every] > 0]) + 0.3
-            out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
-            for k in range(2):
-                error[t, k] = scale * np.sqrt(max(inverse[2 + k, 2 + k], 0.0))
-            if iteration == 0:
-                sampled = values[::median_every].astype(np.float64)
-                gain = np.median(sampled) / reference_median
-                gain_only_scale = 1.4826 * np.median(np.abs(sampled - gain * sampled_basis)) + 0.3
-                if gain_only_scale < scale:
-                    scale = gain_only_scale
-                    for k in range(count):
-                        residuals[k] = abs(values[k] - gain * basis[0, k])
-            n_inliers = 0.0
-            for k in range(count):
-                inlier[k] = 1.0 if residuals[k] < 4 * scale else 0.0
-                n_inliers += inlier[k]
-            if n_inliers > 0.99 * count:
-                break
-    return out, error
-
-
-@njit(nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _masked_products(basis: np.ndarray, inlier: np.ndarray) -> np.ndarray:
-    """Products of the rows of `basis` with each other, shape (4, 4), summed over the inliers."""
-    out = np.empty((4, 4))
-    for i in range(4):
-        for j in range(i, 4):
-            total, first, second = 0.0, basis[i], basis[j]
-            for k in range(len(inlier)):
-                total += inlier[k] * first[k] * second[k]
-            out[i, j] = out[j, i] = total
-    return out
+    every = slice(None, None, 4)  # pixels of which medians are taken (derived)
+    solution, error = np.zeros((len(data), 4)), np.full((len(data), 2), np.inf)
+    typical = max(float(np.median(basis[0, every])), 1e-9)
+    for k, values in enumerate(data.astype(float)):
+        used, pixels, inlier = basis, values, np.ones(len(values), dtype=bool)
+        for turn in range(2):
+            inverse = np.linalg.inv(used @ used.T + ridge)
+            solution[k] = inverse @ (used @ pixels)
+            residual = np.abs(values - solution[k] @ basis)
+            scale = 1.4826 * np.median(residual[every][inlier[every]]) + 0.3  # with rounding to whole grey levels
+            error[k] = scale * np.sqrt(np.maximum(np.diagonal(inverse)[2:], 0.0))
+            if turn == 0:  # outliers of a change of brightness alone, where that fits better
+                of_gain = np.abs(values - np.median(values[every]) / typical * basis[0])
+                gain_scale = 1.4826 * np.median(of_gain[every]) + 0.3
+                residual, scale = (of_gain, gain_scale) if gain_scale < scale else (residual, scale)
+                inlier = residual < 4 * scale
+                if np.count_nonzero(inlier) > 0.99 * inlier.size:
+                    break
+                used, pixels = basis[:, inlier], values[inlier]
+    return solution, error
