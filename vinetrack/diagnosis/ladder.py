@@ -208,7 +208,7 @@ def _final_speed_errors(
     # position (chosen)
     times = [3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
-    runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
+    runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces, host=fit.predictor.host)
     errors = {}
     for trial, time_s, run in zip(predicted, times, runs, strict=True):
         motion = kinematics.get(trial.name) or estimate_kinematics(
