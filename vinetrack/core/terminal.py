@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from importlib import import_module
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -64,7 +64,8 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 @contextmanager
-def _bar(description: str, total: int | None) -> Iterator[Progress]:
+def waiting(description: str, total: int | None = None) -> Iterator[Progress]:
+    """A bar for work of `total` steps, or of unknown length, with the elapsed time."""
     from rich import progress as rich
     from rich.console import Console
 
@@ -78,15 +79,10 @@ def _bar(description: str, total: int | None) -> Iterator[Progress]:
 
 def progress(items: Sequence[Item] | Iterator[Item], description: str, total: int | None = None) -> Iterator[Item]:
     """Yield items, and show how many are done; `total` is their number if they are no sequence."""
-    with _bar(description, len(items) if isinstance(items, Sequence) else total) as bar:
+    with waiting(description, len(items) if isinstance(items, Sequence) else total) as bar:
         for item in items:
             yield item
             bar.advance(bar.task_ids[0])
-
-
-def waiting(description: str) -> AbstractContextManager[Progress]:
-    """A bar for work of unknown length, with the elapsed time."""
-    return _bar(description, None)
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:

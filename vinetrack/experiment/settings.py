@@ -1,8 +1,8 @@
 """Settings shared by all trials (`experiment.yaml`) and settings of the analysis (`config/config.yaml`).
 
 The pydantic models below define all keys, defaults, allowed values and meanings; a string beside a type says how to
-measure the value. A test keeps `config/config.yaml` consistent with them. All unknown keys, repeated keys and values
-that are not allowed are reported together.
+measure the value. A test keeps `config/config.yaml` consistent with them. All unknown keys and values that are not
+allowed are reported together.
 """
 
 from __future__ import annotations
