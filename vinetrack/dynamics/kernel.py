@@ -33,7 +33,7 @@ from vinetrack.core.tables import write_text
 from vinetrack.core.threads import available_cores, thread_pool
 from vinetrack.dynamics.equations import BatchArrays
 from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
-from vinetrack.effects import Effect, State, TrialInputs, effect_sources
+from vinetrack.effects import Effect, State, TrialInputs
 
 _STATE = (
     "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
@@ -200,9 +200,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     parts = [source, *(file.read_text(encoding="utf-8") for file in integrator)]
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], units)]
     parts += [numba.__version__, sys.version]
-    # The compiled form refers to the modules of the effects by name, so the names are part of the hash.
+    # The compiled form refers to the modules of the effects by name; a name holds the hash of the file's text.
     parts += [function.__module__ for effect in effects for function in effect.functions.values()]
-    parts += [file.read_text(encoding="utf-8") for effect in effects for file in effect_sources(effect.path)]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     if digest in _LOADED:
         return _LOADED[digest]

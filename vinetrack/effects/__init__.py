@@ -11,7 +11,6 @@ from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, Parameter, S
 from vinetrack.effects._catalogue import (
     EffectError,
     catalogue,
-    effect_sources,
     explanation,
     find_effect,
     listing,
@@ -33,7 +32,6 @@ __all__ = [
     "TrialInputs",
     "Worked",
     "catalogue",
-    "effect_sources",
     "explanation",
     "find_effect",
     "listing",

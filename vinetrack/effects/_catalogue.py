@@ -9,14 +9,12 @@ import ast
 import contextlib
 import difflib
 import hashlib
-import importlib.util
 import inspect
 import json
 import math
 import os
 import re
 import sys
-import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -93,81 +91,29 @@ class EffectError(UserError, ValueError):
     effect = column = ""
 
 
-# Executed effect files, by path and module name, so that each path keeps its own functions
-_MODULES: dict[tuple[Path, str], ModuleType] = {}
+# What an effect may import. It is one file, so that the hash of its text stands for it wherever it lies.
+_IMPORTED = {"__future__", "math", "numba", "numpy", "scipy", "typing", "vinetrack"}
 
 
 def _load_module(path: Path) -> ModuleType:
     """Execute one effect file and return it as a module. It is registered in `sys.modules`, where the compiled form of
-    a model looks for it, under a name derived from its text, and from its path where it may depend on that.
+    a model looks for it, under a name derived from its text.
     """
-    whole, text = path.resolve(), path.read_bytes()
-    if whole.is_relative_to(PACKAGE):
-        place = whole.relative_to(PACKAGE).as_posix()
-    else:
-        place = "" if _is_independent_of_path(text) else str(whole)
-    digest = hashlib.sha256(place.encode() + text).hexdigest()[:12]
-    name = f"vinetrack_effect_{path.stem}_{digest}"
-    if (whole, name) in _MODULES:
-        return _MODULES[whole, name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None:
-        raise EffectError(f"{path}: an effect is a Python file whose name ends in .py.")
-    module = importlib.util.module_from_spec(spec)
-    before = sys.modules.get(name)
-    sys.modules[name] = module
-    try:
-        # The text itself is executed: cached bytecode could be that of an older version saved within the same second.
-        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
-    except Exception:
-        del sys.modules[name]
-        raise
-    finally:
-        if before is not None:  # compiled forms refer to the functions of the file that was loaded first
-            sys.modules[name] = before
-    _MODULES[whole, name] = module
-    return module
-
-
-def _imported(tree: ast.Module) -> Iterator[str]:
-    """Dotted names that a file imports, from wherever in it; what is imported from a module may be one too."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            module = "." * node.level + (node.module or "")
-            yield module
-            yield from (f"{module}{'' if module.endswith('.') else '.'}{alias.name}" for alias in node.names)
-
-
-def _is_independent_of_path(text: bytes) -> bool:
-    """Whether an effect is independent of the location of its file: no local imports, no names such as `__file__`."""
-    try:
+    # The text itself is executed: cached bytecode could be that of an older version saved within the same second.
+    text = path.read_bytes()
+    name = f"vinetrack_effect_{path.stem}_{hashlib.sha256(text).hexdigest()[:12]}"
+    if name not in sys.modules:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError):
-        return False
-    plain = {"__future__", "math", "numpy", "vinetrack"}
-    imported = {name.split(".")[0] for name in _imported(tree)}
-    return imported <= plain and not any(
-        isinstance(node, ast.Name) and node.id.startswith("__") for node in ast.walk(tree)
-    )
-
-
-def effect_sources(path: Path) -> list[Path]:
-    """The file of an effect, and those of the modules that it imports, directly or not, beside the installed ones."""
-    if path.is_relative_to(PACKAGE):
-        return [path]
-    installed = [PACKAGE, *(Path(folder) for folder in sysconfig.get_paths().values())]
-    found, waiting = [path], [(path, "")]
-    while waiting:
-        file, package = waiting.pop()
-        for name in _imported(ast.parse(file.read_bytes())):
-            module = sys.modules.get(importlib.util.resolve_name(name, package) if package else name)
-            origin = Path(getattr(module, "__file__", None) or "")
-            if origin.suffix == ".py" and origin not in found and not any(map(origin.is_relative_to, installed)):
-                found.append(origin)
-                waiting.append((origin, getattr(module, "__package__", "") or ""))
-    return found
+        imports = [node.names for node in ast.walk(tree) if isinstance(node, ast.Import)]
+        imported = {alias.name.split(".")[0] for names in imports for alias in names}
+        imported |= {(n.module or ".").split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+        if foreign := sorted(imported - _IMPORTED):
+            known = ", ".join(sorted(_IMPORTED - {"__future__"}))
+            raise EffectError(f"{path}: imports {', '.join(foreign)}, but an effect may only import {known}.")
+        module = ModuleType(name)
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
+        sys.modules[name] = module
+    return sys.modules[name]
 
 
 def load_effect(path: Path | str) -> Effect:
