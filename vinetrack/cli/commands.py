@@ -169,10 +169,10 @@ def _overlay(results: Path, trial: str, experiment: Path | None, seconds: float)
 def _settings(page: Path | None) -> Answer | None:
     """List all columns of the sheet and all keys of the settings, with unit, default, bounds and meaning."""
     from vinetrack.core.tables import write_text
-    from vinetrack.experiment.settings import reference_content, reference_lines, reference_page
+    from vinetrack.experiment.settings import reference_content, reference_page
 
     if page is None:
-        return reference_lines(), reference_content()
+        return reference_page().splitlines(), reference_content()
     write_text(page, reference_page())
     return None
 

@@ -22,7 +22,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
 from pydantic.functional_validators import BeforeValidator, field_validator, model_validator
 
-from vinetrack.core import terminal
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.tables import Table, TableError, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
@@ -510,17 +509,6 @@ A blank cell means the default.
             cells = (f"`{e.name}`", e.default, e.allowed, f"{e.meaning} *{e.measured}*" if e.measured else e.meaning)
             page += "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
     return page
-
-
-def reference_lines() -> list[str]:
-    """Return the reference as aligned lines for the terminal, one per column or key."""
-    head = ("name", "unit", "default", "allowed", "meaning")
-    lines: list[str] = []
-    for _, title, entries in _groups():
-        rows = [(e.name, e.unit, e.default, e.allowed, f"{e.meaning} {e.measured}".rstrip()) for e in entries]
-        lines += [title, *terminal.table(rows, head, indent="  ", align="<<<<<"), ""]
-    hint = "A column may state another unit in its name (pressure_psi, pressure_bar, diameter_in, …)"
-    return [*lines, f"{hint}: it is converted."]
 
 
 def _default(name: str, field: FieldInfo) -> str:
