@@ -1,6 +1,5 @@
-"""What people read: units and numbers, bars and colour on a terminal, compilation; and threads of linear algebra."""
+"""What people read: units and numbers, bars on a terminal, compilation; and threads of linear algebra."""
 
-import io
 import math
 import tempfile
 
@@ -8,26 +7,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from vinetrack.core.terminal import progress, severity_first, waiting
+from vinetrack.core.terminal import progress, waiting
 from vinetrack.core.threads import in_one_blas_thread, njit
 from vinetrack.core.units import UNITS, convert, interval, number, split_unit, with_error, with_interval
 from vinetrack.dynamics.kernel import _cache_folder
 from vinetrack.pipeline.stages import COMPILING, compilation_told
-
-
-class Screen(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_colour_is_for_terminals_that_want_it(monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    assert severity_first("error: a", Screen()) == "\x1b[31;1merror\x1b[0m: a"
-    assert severity_first("error: a", io.StringIO()) == "error: a"
-    for name, value, wanted in (("NO_COLOR", "1", False), ("NO_COLOR", "", True), ("TERM", "dumb", False)):
-        monkeypatch.setenv(name, value)
-        assert ("\x1b" in severity_first("error: a", Screen())) == wanted
 
 
 def test_nothing_is_shown_where_nobody_looks(capfd):

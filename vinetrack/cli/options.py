@@ -39,9 +39,14 @@ def json_to_terminal(json_file: Path | None) -> bool:
 
 
 def _say(line: str, err: bool = False) -> None:
-    from vinetrack.core.terminal import severity_first
+    """Print a line; on a terminal that wants colours, `error` and `warning` at its beginning have theirs."""
+    from rich.console import Console
+    from rich.text import Text
 
-    typer.echo(severity_first(line, sys.stderr if err else sys.stdout), err=err)
+    text = Text(line)
+    text.highlight_regex("^error(?=:)", "bold red")
+    text.highlight_regex("^warning(?=:)", "bold yellow")
+    Console(stderr=err).print(text, soft_wrap=True)
 
 
 @contextmanager

@@ -1,36 +1,24 @@
-"""Terminal output: aligned tables with units, progress bars, colour; and tables and figures in a notebook.
+"""Terminal output: aligned tables with units, progress bars; and tables and figures in a notebook.
 
-Progress is drawn by rich on standard error, and only on a terminal; piped or logged output stays plain. Colour is used
-on a terminal unless NO_COLOR is set (https://no-color.org).
+Progress is drawn by rich on standard error, and only on a terminal; piped or logged output stays plain.
 """
 
 from __future__ import annotations
 
 import html
-import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.progress import Progress
 
 Item = TypeVar("Item")
-
-
-def severity_first(line: str, stream: TextIO) -> str:
-    """Return a line of `format_problems` with its first word in the colour of its severity."""
-    word, colon, message = line.partition(":")
-    colours = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
-    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
-    if plain or word not in colours:
-        return line
-    return f"\x1b[{colours[word]};1m{word}\x1b[0m{colon}{message}"
 
 
 def table(
