@@ -85,16 +85,15 @@ def test_the_missing_force_is_drawn_against_each_variable():
 def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
     cells = [
         {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}
-        | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": 0.1e-3, "scatter_m": 0.6e-3}
+        | {"misfit_m": sign * 1e-3 * (g + 1), "scatter_m": 0.6e-3}
         for (k, sign), g in product(((24, 1), (60, -1)), range(4))
     ]
-    before, after = figures.draw_where(pd.DataFrame(cells), "air drag").axes
-    sides = [to_hex(patch.get_facecolor()) for patch in before.patches]
+    (ax,) = figures.draw_where(pd.DataFrame(cells)).axes
+    sides = [to_hex(patch.get_facecolor()) for patch in ax.patches]
     assert sides == [BLUE.lower()] * 4 + [VERMILLION.lower()] * 4
-    depths = [patch.get_alpha() for patch in before.patches[:4]]
+    depths = [patch.get_alpha() for patch in ax.patches[:4]]
     assert depths == sorted(depths)
-    assert [text.get_text() for text in before.texts] == ["+2.0", "+3.0", "+4.0", "−2.0", "−3.0", "−4.0"]
-    assert not after.texts
+    assert [text.get_text() for text in ax.texts] == ["+2.0", "+3.0", "+4.0", "−2.0", "−3.0", "−4.0"]
 
 
 def test_cosines_stand_below_the_diagonal_and_ties_are_framed():

@@ -265,45 +265,38 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
 
 
 @figure("where", "where", "Misfit by condition and position", data="where")
-def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
-    """Misfit (measured minus model, mean over replicates) of every condition along its growth, before and, if
-    effects were added, after. Blue: the vine is ahead of the model; vermillion: behind. Numbers, in millimetres,
-    are written where the misfit exceeds twice its standard error from replicate scatter. A pattern common to all
-    conditions, or growing towards one pressure, is systematic; isolated patches are chance.
+def draw_where(where: pd.DataFrame) -> Figure | None:
+    """Misfit of the initial model (measured minus model, mean over replicates) of every condition along its growth.
+    Blue: the vine is ahead of the model; vermillion: behind. Numbers, in millimetres, are written where the misfit
+    exceeds twice its standard error from replicate scatter. A pattern common to all conditions, or growing towards one
+    pressure, is systematic; isolated patches are chance.
     """
     from matplotlib.patches import Rectangle
 
-    names = {"misfit_before_m": "before", "misfit_after_m": f"after: with {added}" if added else "after"}
-    shown = [c for c in names if len(where) and np.isfinite(st.column(where, c)).any()]
-    if not shown:
+    if where.empty:
         return None
-    known_mm = 1e3 * np.abs(where[shown].to_numpy(dtype=float))
-    full_mm = max(float(np.nanpercentile(known_mm, 97)), 1e-6)
+    full_mm = max(1e3 * float(np.nanpercentile(where["misfit_m"].abs(), 97)), 1e-6)
     counts = where.drop_duplicates("condition_label").set_index("condition_label")["n_trials"]
     # Conditions with the largest misfit: 48 of 0.3 in each are 16 in together; a page shows no more at once.
-    square = (where.set_index("condition_label")[shown[0]].astype(float) ** 2).groupby(level=0).mean()
+    square = (where.set_index("condition_label")["misfit_m"] ** 2).groupby(level=0).mean()
     largest = set(square.sort_values(ascending=False, kind="stable").index[:48])
     labels = [str(label) for label in counts.index if label in largest]
     numbered = len(labels) <= 26  # with more, the figure is scaled down until numbers of 7.5 pt cannot be read
-    fig = st.new_figure(2.6 + 4.3 * len(shown), 0.3 * len(labels) + 1.75)
-    axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for ax, name in zip(axes, shown, strict=True):
-        table = where.assign(misfit_mm=st.column(where, name, 1e3))
-        for row in st.rows(table[table["condition_label"].isin(labels) & np.isfinite(table["misfit_mm"])]):
-            y = labels.index(row.condition_label)
-            left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
-            # Cells become transparent with decreasing misfit, so that the page shows through.
-            depth, colour = min(abs(row.misfit_mm) / full_mm, 1.0), AHEAD if row.misfit_mm > 0 else BEHIND
-            ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, facecolor=colour, alpha=0.85 * depth, lw=0))
-            beyond = not abs(row.misfit_mm) <= 2e3 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
-            if numbered and beyond and depth > 0.06:
-                words = st.with_minus(row.misfit_mm, "+.0f" if abs(row.misfit_mm) >= 9.95 else "+.1f")
-                ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=st.INK)
-        ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55), xlabel="along the growth (%)")
-        ax.grid(visible=False)
-        ax.tick_params(axis="y", length=0)
-        ax.set_title(names[name], fontsize=10)
-    axes[0].set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
+    fig, ax = st.one_panel(6.9, 0.3 * len(labels) + 1.75, xlabel="along the growth (%)")
+    for row in st.rows(where[where["condition_label"].isin(labels) & np.isfinite(where["misfit_m"])]):
+        y, misfit_mm = labels.index(row.condition_label), 1e3 * row.misfit_m
+        left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
+        # Cells become transparent with decreasing misfit, so that the page shows through.
+        depth, colour = min(abs(misfit_mm) / full_mm, 1.0), AHEAD if misfit_mm > 0 else BEHIND
+        ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, facecolor=colour, alpha=0.85 * depth, lw=0))
+        beyond = not abs(row.misfit_m) <= 2 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
+        if numbered and beyond and depth > 0.06:
+            words = st.with_minus(misfit_mm, "+.0f" if abs(misfit_mm) >= 9.95 else "+.1f")
+            ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=st.INK)
+    ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55))
+    ax.grid(visible=False)
+    ax.tick_params(axis="y", length=0)
+    ax.set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
     words = f"full colour: {full_mm:.2g} mm{'; numbers in mm, where beyond scatter' if numbered else ''}"
     handles = [
         st.patch_key("measured is ahead of the model", AHEAD, 0.85),
@@ -313,7 +306,7 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     if len(counts) > len(labels):
         words = f"the {len(labels)} of {len(counts)} conditions with the largest misfit"
         handles.append(st.patch_key(words, "none"))
-    st.page_legend(fig, handles, 3 if len(shown) > 1 else 2, handlelength=1.3)
+    st.page_legend(fig, handles, 2, handlelength=1.3)
     return fig
 
 
@@ -509,24 +502,21 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, for the
-    figure `where`: of the initial model with its error as found there, of the final one as mean over the trials.
+    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, with its
+    error as found there, for the figure `where`.
     """
     import pandas as pd
 
-    rows: list[dict[str, Any]] = []
-    for condition, label in labels.items() if len(located) else ():
-        members = trials[(trials["condition"] == condition) & (trials["time_s"] >= 0)]
-        after_m, n_trials = members["lead_position_m"] - members["model_after_m"], members["trial"].nunique()
-        for row in st.rows(located[located["condition"] == condition]) if n_trials else ():
-            whole_m = located.loc[located["vine"] == row.vine, "to_m"].max()
-            inside = (members["model_before_m"] >= row.from_m) & (members["model_before_m"] < row.to_m)
-            misfit_after_m = after_m[inside].groupby(members["trial"]).mean().mean()
-            misfit = {"misfit_before_m": row.mean_residual_m, "misfit_after_m": misfit_after_m}
-            place = {"growth_from": row.from_m / whole_m, "growth_to": row.to_m / whole_m}
-            name = {"condition": condition, "condition_label": label, "n_trials": n_trials}
-            rows.append(name | place | misfit | {"scatter_m": row.sigma_m})
-    return pd.DataFrame(rows)
+    if located.empty:
+        return pd.DataFrame()
+    counts = trials[trials["time_s"] >= 0].groupby("condition")["trial"].nunique()
+    whole_m = located.groupby("vine")["to_m"].transform("max")
+    parts = {"growth_from": located["from_m"] / whole_m, "growth_to": located["to_m"] / whole_m}
+    names = {"condition_label": located["condition"].map(labels), "n_trials": located["condition"].map(counts)}
+    table = located.assign(**names, **parts, misfit_m=located["mean_residual_m"], scatter_m=located["sigma_m"])
+    columns = ["condition", *names, *parts, "misfit_m", "scatter_m"]
+    place = {condition: i for i, condition in enumerate(labels)}
+    return table.dropna(subset=list(names))[columns].sort_values("condition", key=lambda c: c.map(place), kind="stable")
 
 
 def ranking_table(ranked: Round) -> pd.DataFrame:
