@@ -96,15 +96,6 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
     assert [text.get_text() for text in ax.texts] == ["+2.0", "+3.0", "+4.0", "−2.0", "−3.0", "−4.0"]
 
 
-def test_cosines_stand_below_the_diagonal_and_ties_are_framed():
-    rows = [("b", "a", 0.97), ("c", "a", -0.5), ("c", "b", 0.0)]
-    (ax,) = figures.draw_cosines(pd.DataFrame(rows, columns=["effect", "other", "cosine"])).axes
-    assert [text.get_text() for text in ax.texts] == [".97", "−.50", ".00"]
-    assert len([patch for patch in ax.patches if patch.get_linewidth() > 0]) == 1
-    assert [label.get_text() for label in ax.get_xticklabels()] == ["a", "b"]
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["b", "c"]
-
-
 # The learned force as a curve or a map, with units, and blank outside the range of the trials.
 Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
 

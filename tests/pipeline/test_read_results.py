@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, one_round, refused
+from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
 
 from vinetrack.core import published
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
-from vinetrack.diagnosis.result import Diagnosis, Round
+from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures import diagnosis_figures as drawn
 from vinetrack.figures.registry import FigureTables, diagnosis_figures, draw, label_conditions
 from vinetrack.figures.style import render
@@ -136,7 +136,7 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
         found = drawn.read_diagnosis_tables(results, conditions())
         assert found is not None
         pictures = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
-        assert set(pictures) == {"ladder", "before_after", "where", "candidates", "cosines"}
+        assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
         for name, figure in pictures.items():
             assert render(figure, ["svg"])["svg"]
             assert len(getattr(found, diagnosis_figures()[name].data)) > 0
@@ -156,14 +156,6 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
         assert ("model_after_m" in joined) == bool(effects)
         if effects:
             assert np.allclose(joined["model_after_m"], joined["lead_position_m"], rtol=0, atol=1e-12)
-
-
-def test_ties_stand_in_the_order_of_the_ranking():
-    cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    cells = drawn.cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
-    leak, time_base = ["leak", "air_drag", 0.3], ["time_base", "air_drag", 0.2]
-    assert cells.to_numpy().tolist() == [leak, time_base, ["time_base", "leak", 0.1]]
-    assert drawn.cosine_cells(Round.from_json({"verdict": ""})).empty
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: errors of the models, the misfit and the missing force, candidates and what ties them.
+"""Figures of a diagnosis: errors of the models, the misfit and the missing force, candidates.
 
 The model before the added effects is vermillion and dashed, the model after blue and full, here and in the clips.
 """
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER = st.VERMILLION, st.BLUE
 AHEAD, BEHIND = st.BLUE, st.VERMILLION  # Colours of a vine ahead of the model, and behind it
-TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
 # ------------------------------------------------------------------------------
 # Errors of the models of the ladder, and the condition with the largest error of the initial model, before and after.
@@ -123,7 +122,7 @@ def rms_m(trials: pd.DataFrame, model: str) -> float:
 
 
 # ------------------------------------------------------------------------------
-# Candidates of the diagnosis: their gains, the cosines between them, and parameters that drift with a condition.
+# Candidates of the diagnosis and their gains, and parameters that drift with a condition.
 
 # By role of a candidate: label, colour and opacity
 _ROLES = {
@@ -180,39 +179,6 @@ def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     role = np.where(answer, "answer", np.where(table["kind"] == "measurement", "measurement", "physical"))
     known = table.assign(height=height, in_answer_set=answer, role=role)[np.isfinite(height)]
     return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(12)
-
-
-@figure("cosines", "tied", "Candidates that these trials cannot tell apart", data="cosines")
-def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
-    """Cosine between the effects of two candidates on the trajectories, after projecting out the fitted parameters:
-    1 the same, −1 the same with opposite sign, 0 nothing in common. Framed: these trials cannot tell the two apart.
-    """
-    from matplotlib.patches import Rectangle
-
-    if not len(cosines):
-        return None
-    # 22 cells of 0.36 in, which hold two digits of 7.5 pt, make a square of 8 in.
-    effects = list(dict.fromkeys([*cosines["other"], *cosines["effect"]]))[:22]
-    n = len(effects)
-    fig, ax = st.one_panel(0.36 * n + 2.3, 0.36 * n + 2.0)
-    known = cosines[cosines["effect"].isin(effects) & cosines["other"].isin(effects) & np.isfinite(cosines["cosine"])]
-    for effect, other, value in known.itertuples(index=False):
-        i, j, tied = effects.index(effect), effects.index(other), abs(value) >= TIED_COSINE
-        colour, alpha = st.BLUE if value > 0 else st.VERMILLION, min(abs(value), 1.0) ** 2 * 0.8
-        ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, alpha=alpha, lw=0))
-        if tied:
-            ax.add_patch(Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=st.INK, lw=1.4))
-        words = st.with_minus(value, ".2f").replace("0.", ".", 1)
-        ax.text(j, i, words, ha="center", va="center", fontsize=7.5, fontweight="bold" if tied else "normal")
-    names = [str(name).replace("_", " ") for name in effects]
-    size = min(st.fitting_size(name, 115, 9, bold=False) for name in names)
-    ax.set_xticks(range(n - 1), names[:-1], rotation=55, ha="right", rotation_mode="anchor", fontsize=size)
-    ax.set_yticks(range(1, n), names[1:], fontsize=size)
-    ax.set(xlim=(-0.5, n - 1.5), ylim=(n - 0.5, 0.5), aspect="equal")
-    ax.tick_params(length=0)
-    ax.grid(visible=False)
-    st.small_title(ax, f"cosine; framed: tied (|cos| ≥ {TIED_COSINE:g})")
-    return fig
 
 
 # Colour and line of the models in the figure of drifts
@@ -448,7 +414,6 @@ class DiagnosisTables:
         self.drift = found.get("drift_groups.csv", none)
         self.missing_force = found.get("missing_force.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
-        self.cosines = cosine_cells(rounds[0]) if rounds else none
         self.rounds: list[tuple[str, pd.DataFrame]] = []
         for i, ranked in enumerate(rounds):
             more = [name for name in ranked.model if name not in rounds[0].model]
@@ -529,14 +494,3 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
         for c in ranked.ranking
     ]
     return pd.DataFrame(rows, columns=columns)
-
-
-def cosine_cells(ranked: Round) -> pd.DataFrame:
-    """Return the cosines of a round with one row per pair, ordered by rank, with the answer set first."""
-    import pandas as pd
-
-    names, matrix = ranked.cosine_names, ranked.cosines
-    ranks = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
-    order = sorted(range(len(matrix)), key=lambda i: ranks.get(names[i], (True, len(ranked.ranking))))
-    rows = [(names[i], names[j], matrix[i][j]) for k, i in enumerate(order) for j in order[:k]]
-    return pd.DataFrame(rows, columns=["effect", "other", "cosine"])

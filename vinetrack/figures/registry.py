@@ -94,7 +94,7 @@ def campaign_figures() -> dict[str, RegisteredFigure]:
 
 def diagnosis_figures() -> dict[str, RegisteredFigure]:
     """Return the figures that show the diagnosis by name."""
-    return figures_of("verdict", "where", "candidates", "tied", "drift")
+    return figures_of("verdict", "where", "candidates", "drift")
 
 
 def draw(name: str, tables: Any) -> Figure | None:

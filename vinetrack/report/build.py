@@ -25,7 +25,6 @@ from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.effects import EffectError, catalogue, own_effects
 from vinetrack.experiment.schema import LIMITED
-from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import RULE_NAMES, TOKENS, page_tokens, rows
 from vinetrack.inference.fit_result import Number
@@ -241,6 +240,9 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
                 shown, factor = display_unit(unit)
                 rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
     return rows
+
+
+TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
 
 def tied_pairs(entry: Round) -> list[str]:
