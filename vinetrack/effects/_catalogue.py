@@ -119,12 +119,6 @@ def _load_module(path: Path) -> ModuleType:
 def load_effect(path: Path | str) -> Effect:
     """Read one effect from its file, whose name it has; an EffectError says where the file does not follow the contract
     of `Effect`.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
-    'air_drag'
     """
     path = Path(path)
     try:
@@ -215,12 +209,6 @@ def _parameter_faults(parameter: Parameter) -> Iterable[str]:
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
     """Return every effect of vinetrack by name: base effects first, then alphabetical.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.catalogue()["air_drag"].kind
-    'physical'
     """
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
@@ -230,13 +218,6 @@ def catalogue() -> Mapping[str, Effect]:
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
     """Return the effect of this name, from the user's own effects or else from the catalogue; an EffectError suggests
     the nearest name.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.find_effect("air_drg")
-    Traceback (most recent call last):
-    vinetrack.effects._catalogue.EffectError: ...
     """
     known = {**catalogue(), **(user_effects or {})}
     if name in known:
@@ -322,12 +303,6 @@ _RIG = TrialInputs.of(replace(REFERENCE_TRIAL, bends=(Bend(0.1, 0.1, 0.1),)))
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
     """Read and check a user's effects; returns them by name. An EffectError says in one sentence where a file is not an
     effect, two have the same name, or one fails its checks.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> dict(vt.effects.own_effects([]))
-    {}
     """
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):
