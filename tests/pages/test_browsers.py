@@ -61,7 +61,6 @@ def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_
     # The effect that is missing brings every condition to what an adequate model would show.
     assert (errors() < errors("highest")).all()
     assert (before > errors("highest")).any()
-    assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 
 def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor):

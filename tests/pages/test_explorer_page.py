@@ -35,7 +35,7 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages import controls
-from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, commands, predict_choice, slider_range
+from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, predict_choice, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
 from vinetrack.results.folder_layout import Results, ResultsError
@@ -103,7 +103,6 @@ def test_a_slider_adds_its_effect_and_moves_the_curves(browser):
     assert [list(part) for part in browser.model("model_curves").data["ys"]] != before
     browser.turn()  # words follow in a turn of their own
     assert "reservoir depletion" in browser.text("headline")
-    assert browser.text("commands") == ""
 
 
 def test_conditions_and_trials_can_be_chosen(browser):
@@ -135,7 +134,6 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser):
     gamma, *sigma = re.findall(r"[\d.]+", found)[:2]
     # 1.4 is what the trials were grown with, and the largest that a gas can have.
     assert (gamma, "at its bound" in found) == ("1.4", True) or abs(float(gamma) - 1.4) < 2 * float(sigma[0]) < 0.03
-    assert "vinetrack add reservoir_depletion" in browser.text("commands")
     assert re.search(r"−2 ln L fell by [\d,.]+ for 1 parameter more", browser.text("numbers"))
     browser.click("hold")
     browser.model(GAMMA).value = 1.2
@@ -148,18 +146,18 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser):
     browser.click("hold")
 
 
-def test_a_diagnosis_appears_by_itself(campaign, background, tmp_path):
+def test_a_diagnosis_appears_when_the_page_is_opened_again(campaign, background, tmp_path):
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)
     own = BackgroundFit(open_campaign(folder, campaign.experiment.folder))
     own.prediction, own.fitted = background.prediction, background.fitted
     page = Browser(own)
-    write_diagnosis(folder)
-    page.page._check_for_diagnosis()
-    assert "(cosine 0.970)" in page.text("tied")
-    assert "chamber (l)" in page.text("next")
+    assert f"vinetrack diagnose {folder}" in page.text("tied")
     page.page.close()
+    write_diagnosis(folder)
     again = Browser(own)
+    assert "(cosine 0.970)" in again.text("tied")
+    assert "chamber (l)" in again.text("next")
     assert again.page.panel.root.children[0].children[0].label == "Suspected by the diagnosis"
     again.page.close()
     (folder / "diagnosis.json").write_text("[]", encoding="utf-8")
@@ -324,8 +322,6 @@ def test_the_proposed_effect_is_opened_fitted_and_saved(opened, tmp_path, monkey
     assert page.model("tick_spring_line").active
     page.click("refit")
     page.until(lambda: page.model("refit").label == "Refit" and not page.page._sizes_changed, 240)
-    page.page._update_text()
-    assert f"vinetrack add {(folder / 'spring_line.py').as_posix()}" in page.text("commands")
     page.click("save")
     assert "Saved." in page.text("saved")
     page.page.close()
@@ -407,17 +403,6 @@ def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value():
     assert slider_range("pressure_gauge.delta", gauge, -3e3) == (-3e3, 2e3)
     damping = Parameter("B", "B", "N·(s/m)ⁿ", 3.0, bounds=(0.0, math.inf), shared="vine")
     assert slider_range("eversion_damping.B", damping, 6.0) == (0.0, 12.0)
-
-
-def test_the_page_shows_the_command_that_reproduces_it(campaign):
-    start = choice_in_use(campaign)
-    folder = campaign.folder.as_posix()
-    assert commands(campaign, start, fitted=True) == [f"vinetrack compare {folder}"]
-    more = start.with_effect("reservoir_depletion").with_effect("leak")
-    added = [f"vinetrack add {name} {folder} --save" for name in ("reservoir_depletion", "leak")]
-    assert commands(campaign, more, fitted=True, save=True) == added
-    assert commands(campaign, more, fitted=False) == []
-    assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path):

@@ -208,8 +208,7 @@ def _parameter_faults(parameter: Parameter) -> Iterable[str]:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Return every effect of vinetrack by name: base effects first, then alphabetical.
-    """
+    """Return every effect of vinetrack by name: base effects first, then alphabetical."""
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})

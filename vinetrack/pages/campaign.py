@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -533,25 +532,6 @@ class BackgroundFit:
     def _notify(self) -> None:
         for listener in list(self.listeners):
             listener()
-
-
-def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:
-    """Return the commands that give the choice without the page; none for sizes that were dragged and not fitted, and
-    for a model without an effect of that in use.
-    """
-    folder = shlex.quote(campaign.folder.as_posix())
-    added = [name for name in choice.effects if name not in campaign.in_use]
-    if not fitted or not set(campaign.in_use) <= set(choice.effects):
-        return []
-    if not added:
-        return [f"vinetrack compare {folder}"]
-    lines = []
-    for name in added:
-        path = campaign.effects[name].path
-        # A file beside the experiment is named by its path until the settings list it.
-        is_unlisted = campaign.own_files([name]) and path.name not in campaign.experiment.settings.effects
-        lines.append(f"vinetrack add {shlex.quote(path.as_posix()) if is_unlisted else name} {folder}")
-    return [f"{line} --save" for line in lines] if save else lines
 
 
 def model_text(names: Sequence[str]) -> str:

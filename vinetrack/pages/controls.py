@@ -229,7 +229,7 @@ class ProposalPanel:
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         command = f"vinetrack propose {page.campaign.folder.as_posix()}"
-        self.text = Div(text=panel("propose", command=command), name="proposal")
+        self.text = Div(text=panel("propose", line=command), name="proposal")
         self._reload = ColumnDataSource({"times": [0]}, name="reload")
         self._reload.js_on_change("data", CustomJS(code="location.reload()"))
         buttons = beside(self.button, self.open)

@@ -34,7 +34,6 @@ from vinetrack.pages.campaign import (
     Job,
     ModelChoice,
     Prediction,
-    commands,
     fit_choice,
     model_text,
     overall_m,
@@ -157,19 +156,16 @@ class Page:
         self.fits: list[Evaluated] = []
         self.held: tuple[Prediction, dict[str, str]] | None = None
         self.diagnosis: Diagnosis | None = None
-        self._diagnosed_at = 0.0
-        self._read_diagnosis()
+        with suppress(ResultsError):
+            self.diagnosis = read_diagnosis(Results(self.campaign.folder))
         self._sizes_changed = False
         self._pending: set[Callable[[], None]] = set()
         self._job: Job[Step, Evaluated] | None = None
         self._begun_s, self._message = 0.0, ""
         self._step: Step | None = None
-        self._step_is_drawn = True
         self._build(reopen)
         background.listeners.append(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
-        # Chosen: interval at which the page looks for a new diagnosis
-        document.add_periodic_callback(self._check_for_diagnosis, 2000)
         document.add_periodic_callback(self._update_status, 200)  # Chosen: the status line shows tenths of a second
         self._background_changed()
 
@@ -189,13 +185,12 @@ class Page:
         self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
-        self.command_text = Div(name="commands")
         buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
         hint = Div(
             text="<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps "
             "this model for comparison.</small>"
         )
-        actions = Column(buttons, hint, self.command_text, name="actions")
+        actions = Column(buttons, hint, name="actions")
         texts = [self.headline, self.status, self.numbers, self.tied, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
         panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
@@ -314,18 +309,8 @@ class Page:
             self._mark_changed()
 
     def _on_step(self, step: Step) -> None:
-        """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
-        was_drawn, self._step, self._step_is_drawn = self._step_is_drawn, step, False
-        if was_drawn:
-            self.document.add_next_tick_callback(self._show_step)
-
-    def _show_step(self) -> None:
-        self._step_is_drawn = True
-        if self._step is None or self._job is None:
-            return
-        self._update_status()
-        self._predict(self.choice.with_sizes(self._step.values))
-        self._soon(self._update_text, TEXT_MS)
+        """Called from a fit's thread; the status line shows it."""
+        self._step = step
 
     def _fit_ended(self, fitted: Evaluated | None, reason: str) -> None:
         if fitted is not None:
@@ -397,9 +382,6 @@ class Page:
         command = f"vinetrack diagnose {self.campaign.folder.as_posix()}"
         set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, rows=rows, pairs=pairs))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
-        lines = self._commands()
-        same = "<small>The same from the command line:</small>" + panel("commands", lines=lines)
-        set_text(self.command_text, same if lines else "")
 
     def _update_status(self) -> None:
         """Update the status line."""
@@ -417,25 +399,7 @@ class Page:
             text = f"<small>{'preparing the model' if background.prediction is None else fitting} …</small>"
         set_text(self.status, text)
 
-    def _read_diagnosis(self) -> bool:
-        """Read the diagnosis of the results, None if there is none or it cannot be read; whether it has changed."""
-        results = Results(self.campaign.folder)
-        changed_at = results.diagnosis.stat().st_mtime if results.diagnosis.exists() else 0.0
-        if changed_at == self._diagnosed_at:
-            return False
-        self.diagnosis, self._diagnosed_at = None, changed_at
-        with suppress(ResultsError):
-            self.diagnosis = read_diagnosis(results)
-        return True
-
-    def _check_for_diagnosis(self) -> None:
-        if self._read_diagnosis():
-            self._update_text()
-
     # ---- saving --------------------------------------------------------------------------------------------------
-
-    def _commands(self, *, save: bool = False) -> list[str]:
-        return commands(self.campaign, self.choice, fitted=not self._sizes_changed, save=save)
 
     def _save(self) -> None:
         folder, effects = self.campaign.experiment.folder, self.choice.effects
@@ -446,8 +410,7 @@ class Page:
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return
         rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
-        given = {"model": model_text(effects), "same": self._commands(save=True), "rerun": rerun}
-        self.saved.text = panel("saved", path=path.as_posix(), **given)
+        self.saved.text = panel("saved", path=path.as_posix(), model=model_text(effects), rerun=rerun)
 
     def close(self) -> None:
         """The page was closed."""
