@@ -168,17 +168,6 @@ def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short
         assert gone not in svg
 
 
-def test_a_sparkline_marks_the_steady_window():
-    time_s = np.linspace(0, 1, 50)
-    svg = build.speed_sparkline(pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": np.ones(50)}), (0.5, 1.0))
-    steady = re.search(r'class="steady" points="([^"]+)"', svg)
-    assert steady is not None
-    x = [float(pair.split(",")[0]) for pair in steady[1].split()]
-    # Half of the 130 px between the margins.
-    assert min(x) == pytest.approx(1 + 130 / 2, abs=3)
-    assert max(x) == pytest.approx(131, abs=0.1)
-
-
 def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn():
     html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], motions={"a": png()})
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]

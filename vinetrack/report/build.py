@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
-from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -357,7 +356,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
             "have absorbed a part of it.",
         ],
-        "tables": [table_one(by_row), *table_two(by_row, departures), *every_row(table)],
+        "tables": [table_one(by_row), *table_two(by_row, departures), every_row(table)],
         "figures": figures,
     }
 
@@ -417,33 +416,15 @@ def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[Repor
     return made
 
 
-def every_row(table: pd.DataFrame) -> list[ReportTable]:
-    """Return all rows of `paper.csv`, in one table for each part of the paper."""
-    head = ("what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
-    elsewhere = "The fast vine, air drag, pressures"
-    parts = table["where"].str.split(";|,| against", n=1, regex=True).str[0].map(_PARTS).fillna(elsewhere)
-    made = []
-    for title in dict.fromkeys([*_PARTS.values(), elsewhere]):
-        body = []
-        for row in rows(table[parts == title]):
-            what = ", ".join(filter(None, (row.quantity, row.setting))) + (f" ({row.unit})" if row.unit != "1" else "")
-            body.append((what, row.as_printed, _ours(row), row.mark, "; ".join(filter(None, (row.how, row.beside)))))
-        if body:
-            made.append(ReportTable(f"{title}, every number", head, body, frozenset({1, 2})))
-    return made
-
-
-# Part of the paper that a place in it belongs to
-_PARTS = {
-    "Table I": "Table I",
-    **dict.fromkeys(("Section III-D", "Section III-E"), "Protocol"),
-    **dict.fromkeys(("Fig. 4", "Fig. 5", "Section IV-A"), "Figs. 4 and 5, Table II"),
-    "Fig. 6": "Fig. 6",
-    **dict.fromkeys(("Fig. 7A", "Fig. 7B"), "Fig. 7"),
-    "Fig. 8": "Fig. 8",
-    "Fig. 9": "Fig. 9",
-    **dict.fromkeys(("Section III-B", "Section V-B"), "Chamber and injector"),
-}
+def every_row(table: pd.DataFrame) -> ReportTable:
+    """Return all rows of `paper.csv`."""
+    head = ("where", "what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
+    body = []
+    for row in rows(table):
+        what = ", ".join(filter(None, (row.quantity, row.setting))) + (f" ({row.unit})" if row.unit != "1" else "")
+        remarks = "; ".join(filter(None, (row.how, row.beside)))
+        body.append((row.where, what, row.as_printed, _ours(row), row.mark, remarks))
+    return ReportTable("Every number", head, body, frozenset({2, 3}))
 
 
 def _value(row: Any, column: str = "ours") -> float | None:
@@ -533,7 +514,6 @@ def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int
         entry = {
             "row": row,
             "frames": count_frames(flags) if flags else "",
-            "spark": "" if curve is None else speed_sparkline(curve, (row.steady_from_s, row.steady_to_s)),
             "data": "" if curve is None else data_uri(f"{name}.csv", _csv(curve.iloc[:: -(-len(curve) // most)])),
             "clip": content["clips"].get(name, ""),
             "windows": list(rows(windows[windows["trial"] == name])),
@@ -545,25 +525,6 @@ def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int
 def _csv(table: pd.DataFrame) -> str:
     """A table as CSV, with five digits, more than the accuracy of any value."""
     return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
-
-
-def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Markup:
-    """Return the speed of a trial as a small SVG, its steady window thick; blank if there is nothing to draw."""
-    width, height = 132, 30  # of the small curve of a trial, px (chosen)
-    known = curve[np.isfinite(curve["time_s"]) & np.isfinite(curve["lead_velocity_m_s"])]
-    known = known.iloc[:: max(len(known) // width, 1)]
-    time_s, speed_m_s = (known[name].to_numpy(dtype=float) for name in ("time_s", "lead_velocity_m_s"))
-    if len(known) < 2 or np.ptp(time_s) <= 0:
-        return Markup()
-    top = max(float(np.percentile(speed_m_s, 99)), 1e-12)
-    x = 1 + (width - 2) * (time_s - time_s[0]) / np.ptp(time_s)
-    y = np.clip(height - 2 - (height - 5) * speed_m_s / top, 1, height - 1)
-    points = [f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True)]
-    thin, thick = " ".join(points), " ".join(compress(points, (time_s >= steady_s[0]) & (time_s <= steady_s[1])))
-    return Markup(
-        f'<svg class="spark" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-        f'aria-hidden="true"><polyline points="{thin}"/><polyline class="steady" points="{thick}"/></svg>'
-    )
 
 
 # ------------------------------------------------------------------------------
