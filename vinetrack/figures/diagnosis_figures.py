@@ -477,7 +477,10 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
     counts = trials[trials["time_s"] >= 0].groupby("condition")["trial"].nunique()
     whole_m = located.groupby("vine")["to_m"].transform("max")
     parts = {"growth_from": located["from_m"] / whole_m, "growth_to": located["to_m"] / whole_m}
-    names = {"condition_label": located["condition"].map(labels), "n_trials": located["condition"].map(counts)}
+    names: dict[str, Any] = {
+        "condition_label": located["condition"].map(labels),
+        "n_trials": located["condition"].map(counts),
+    }
     table = located.assign(**names, **parts, misfit_m=located["mean_residual_m"], scatter_m=located["sigma_m"])
     columns = ["condition", *names, *parts, "misfit_m", "scatter_m"]
     place = {condition: i for i, condition in enumerate(labels)}
