@@ -187,10 +187,14 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
     labels, pressures = [], []
     for name, condition in zip(trials["trial"], trials["condition"], strict=True):
         trial = by_name.get(str(name))
-        size = f"{1e3 * trial.diameter_m:g} mm" if trial else str(condition) or "not readable"
-        labels.append(", ".join([size, *(features(trial)[1:] if trial else ())]))
+        labels.append(condition_label(trial) if trial else str(condition) or "not readable")
         pressures.append(1e-3 * trial.pressure_Pa if trial else float("nan"))
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
+
+
+def condition_label(trial: Trial) -> str:
+    """Return a short label of a trial's condition: diameter, pressure and payload."""
+    return ", ".join([f"{1e3 * trial.diameter_m:g} mm", *features(trial)[1:]])
 
 
 def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:

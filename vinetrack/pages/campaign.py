@@ -20,7 +20,7 @@ from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
-from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
+from vinetrack.figures.registry import condition_label
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
@@ -125,8 +125,10 @@ class Campaign:
 
     @cached_property
     def labels(self) -> Mapping[str, str]:
-        """A short name of every condition: those of its settings that vary."""
-        return condition_labels(self.examples)
+        """The label of every condition in the figures, with its name where two have the same."""
+        labels = {name: condition_label(trial) for name, trial in self.examples.items()}
+        shown = list(labels.values())
+        return {name: label if shown.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
 
     @cached_property
     def host(self) -> Model:
@@ -207,37 +209,6 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
             origin_m = trial_data.rest_origin_m
         trials.append(ExplorerTrial(trial_data, release_s, origin_m))
     return trials
-
-
-def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
-    """Return a label for each condition, from the settings in which the trials of the experiment differ."""
-    written = {name: _settings(trial) for name, trial in conditions.items()}
-
-    def told_apart(keys: Sequence[str]) -> int:
-        return len({tuple(settings.get(key, "") for key in keys) for settings in written.values()})
-
-    kept: list[str] = []
-    for key in dict.fromkeys(key for settings in written.values() for key in settings):
-        sizes = [name for name in LIMITED["choice"] if name not in RIG]
-        # A size that those before determine is left out.
-        before = [other for other in kept if other in sizes] if key in sizes else []
-        if told_apart([*before, key]) > told_apart(before):
-            kept.append(key)
-    told = kept or ["pressure_kPa"]
-    labels = {name: ", ".join(of[key] for key in told if of.get(key)) or name for name, of in written.items()}
-    named = list(labels.values())
-    # Conditions that differ in another setting get their name appended.
-    return {name: label if named.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
-
-
-def _settings(trial: Trial) -> dict[str, str]:
-    """Settings that may distinguish conditions, by column of the sheet and in its units; no payload is none."""
-    texts = {}
-    for name, column in COLUMNS.items():
-        if column.limit and math.isfinite(value := column.of_trial(trial)) and (value or name != "payload_g"):
-            text = f"{value:.3g} {column.unit}".replace("degrees", "°").replace("litres", "L")
-            texts[name] = f"{text} {column.quantity}" if column.unit == "mm" and name != "diameter_mm" else text
-    return texts | ({"bends": f"{len(trial.bends)} bends"} if trial.bends else {})
 
 
 # ------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bokeh.models import (
     Checkbox,
@@ -18,7 +18,6 @@ from bokeh.models import (
     PrintfTickFormatter,
     Slider,
     Toggle,
-    UIElement,
 )
 
 from vinetrack.core.units import SLIDER_UNITS, display_unit
@@ -85,13 +84,6 @@ class SizeSlider:
         self.fitted.update(text=text, visible=number is not None)
 
 
-def _opens(inside: UIElement, title: str, look: str, **keywords: Any) -> Toggle:
-    """A toggle that shows and hides what is inside."""
-    head = Toggle(label=title, active=inside.visible, css_classes=[look], **keywords)
-    head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
-    return head
-
-
 class EffectPanel:
     """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` whenever a tick or a
     size changes.
@@ -140,7 +132,9 @@ class EffectPanel:
         for title, names, visible in groups:
             if names:
                 inside = Column(*(rows[name] for name in names), visible=visible)
-                shown.append(Column(_opens(inside, title, "heading", sizing_mode="stretch_width"), inside))
+                head = Toggle(label=title, active=visible, css_classes=["heading"], sizing_mode="stretch_width")
+                head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
+                shown.append(Column(head, inside))
         self.root = Column(*shown, name="effects")
 
     def show(self, choice: ModelChoice, numbers: Mapping[str, Number]) -> None:
@@ -152,36 +146,29 @@ class EffectPanel:
 
 
 class TrialSelector:
-    """Buttons to select conditions and trials; calls `on_change` when the selection changes."""
+    """Buttons to select conditions; calls `on_change` when the selection changes."""
 
     def __init__(self, campaign: Campaign, on_change: Callable[[], None]) -> None:
-        self.campaign, self._on_change = campaign, on_change
-        self._conditions = self._chips([campaign.labels[name] for name in campaign.conditions], "conditions")
-        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", visible=False)
+        self.campaign = campaign
+        labels = [campaign.labels[name] for name in campaign.conditions]
+        given = {"name": "conditions", "css_classes": ["chips"], "margin": (2, 0)}
+        self._conditions = CheckboxButtonGroup(labels=labels, active=self._every, **given)
+        self._conditions.on_change("active", lambda _attr, _old, _new: on_change())
         tools = beside(
-            button("all", "choose_all", self._all, css_classes=["small"]),
+            button("all", "choose_all", lambda: self._conditions.update(active=self._every), css_classes=["small"]),
             button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
-            _opens(self._trials, "single trials …", "small", name="single_trials"),
             css=":host { gap: 4px; }",
         )
-        self.root = Column(self._conditions, tools, self._trials, name="choose")
+        self.root = Column(self._conditions, tools, name="choose")
 
-    def _chips(self, labels: list[str], name: str, **keywords: Any) -> CheckboxButtonGroup:
-        """Buttons that are all chosen at first."""
-        given = {"name": name, "css_classes": ["chips", name], "margin": (2, 0), **keywords}
-        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), **given)
-        chips.on_change("active", lambda _attr, _old, _new: self._on_change())
-        return chips
-
-    def _all(self) -> None:
-        self._trials.active = list(range(len(self.campaign.trials)))
-        self._conditions.active = list(range(len(self.campaign.conditions)))
+    @property
+    def _every(self) -> list[int]:
+        return list(range(len(self.campaign.conditions)))
 
     def toggle(self, condition: str) -> None:
         """Select this condition alone; if it is alone already, select all."""
         alone = [self.campaign.conditions.index(condition)]
-        every = list(range(len(self.campaign.conditions)))
-        self._conditions.active = every if self._conditions.active == alone else alone
+        self._conditions.active = self._every if self._conditions.active == alone else alone
 
     @property
     def conditions(self) -> list[str]:
@@ -190,9 +177,9 @@ class TrialSelector:
 
     @property
     def shown(self) -> list[int]:
-        """Indices of the trials to draw: those selected, of the selected conditions."""
+        """Indices of the trials of the selected conditions."""
         conditions = set(self.conditions)
-        return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in conditions]
+        return [i for i, aligned in enumerate(self.campaign.trials) if aligned.condition in conditions]
 
 
 # ------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from html import escape
 from pathlib import Path
@@ -39,9 +39,10 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, with_flag
+from vinetrack.figures.registry import features
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, condition_labels, drawn_rows
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, drawn_rows
 from vinetrack.pages.local_page import TEMPLATES, jpeg
 from vinetrack.pipeline.overlays_stage import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
@@ -147,12 +148,10 @@ Errors = Mapping[str, float]
 
 
 def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return a distinguishing label and the colour of each vine."""
+    """Return the sizes of each vine in words, and its colour."""
     styles = vine_styles(campaign.vines)
-    first = {aligned.data.trial.vine: aligned.data.trial for aligned in reversed(campaign.trials)}
-    bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
-    labels = condition_labels(bare) if len(bare) > 1 else dict.fromkeys(bare, "measured")
-    return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
+    sizes = {aligned.data.trial.vine: features(aligned.data.trial)[0] for aligned in campaign.trials}
+    return [(sizes[vine], styles[vine].colour) for vine in campaign.vines]
 
 
 def round_up(value: float, steps: Sequence[float]) -> float:
