@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import UNUSABLE_FLAGS, with_flag
-from vinetrack.core.units import with_error
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 
@@ -80,8 +79,8 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
 # ------------------------------------------------------------------------------
 # One trial: position and speed against time, and the steady window of each rule.
 #
-# The rules are bars in a strip below the curves, so that overlapping windows are separate, with the result of each as
-# text below; their x_ss is drawn across the curve where it was measured.
+# The rules are bars in a strip below the curves, so that overlapping windows are separate, hollow where a rule rejects
+# its window; their x_ss is drawn across the curve where it was measured.
 
 
 @st.look()
@@ -95,9 +94,7 @@ def draw_trial_motion(
     counts = f"{len(kinematics)} points"
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
-    notes = [(st.MUTED, counts), *(line for row in st.rows(windows) for line in _verdict(row))]
-    line_in, strip_in = 0.175, 0.24 * max(len(windows), 1)  # a line of 8.8 pt
-    strip_from = line_in * len(notes) + 0.68
+    strip_from, strip_in = 0.86, 0.24 * max(len(windows), 1)
     speed_from = strip_from + strip_in + 0.12
     lead_from = speed_from + 2.1 + 0.12
     fig, sheet = st.new_sheet(7.2, lead_from + 1.75 + 0.38)
@@ -141,8 +138,7 @@ def draw_trial_motion(
         panel.scale("bottom", numbered=False)
     strip.scale("bottom", "time (s)")
     lead.write(over[0], lead.y[1], title, (0, 8), fontweight="bold", fontsize=st.fitting_size(title, 415, 11))
-    for i, (colour, line) in enumerate(notes):
-        sheet.text(0.09, line_in * (len(notes) - i) + 0.05, line, color=colour, fontsize=8.8, va="top")
+    sheet.text(0.09, 0.22, counts, color=st.MUTED, fontsize=8.8, va="top")
     return fig
 
 
@@ -163,19 +159,6 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
     band_high = float(np.nanmax(speed_m_s + half_band_m_s, initial=high))
     low, high = max(band_low, low - 0.5 * span), min(band_high, high + 0.5 * span)
     return low - 0.04 * span * (low < 0), high + 0.06 * span
-
-
-def _verdict(row: Any) -> list[tuple[str, str]]:
-    """The result of one rule, as coloured lines of text that fit the figure's width."""
-    parts = ["accepted" if row.accepted else "rejected"]
-    if np.isfinite(row.x_ss_m_s):
-        parts.append(f"x_ss {with_error(row.x_ss_m_s, row.x_ss_sigma_m_s)} m/s (tail)")
-    if isinstance(row.reason, str) and row.reason:
-        parts.append(row.reason)
-    sentence = f"{st.RULE_NAMES[row.rule]}: " + ", ".join(parts)
-    unbroken = sentence.replace(" %", "\N{NO-BREAK SPACE}%").replace(" m/s", "\N{NO-BREAK SPACE}m/s")
-    lines = textwrap.wrap(unbroken, 106, subsequent_indent="    ", max_lines=2)
-    return [(st.RULE_COLOURS[row.rule], line) for line in lines]
 
 
 # ------------------------------------------------------------------------------
