@@ -177,7 +177,7 @@ def test_a_torn_recording_is_named(browser, monkeypatch, tmp_path):
     view = RecordingView(tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, pd.DataFrame(), np.zeros(0))
     monkeypatch.setattr("vinetrack.pages.plots.recording_view", lambda *_: view)
     browser.page.film.show_trial(browser.page.campaign.trials[0].name)
-    browser.until(lambda: "tracked" in browser.text("film_caption"), 30)
+    browser.until(lambda: "decoding" not in browser.text("film_caption"), 30)
     browser.page._update_text()
     assert "torn.mp4" in browser.text("film_caption")
 

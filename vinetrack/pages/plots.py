@@ -362,9 +362,9 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
     """Return the view of a trial, or the reason why there is none."""
     if trial.video is None:
         name = trial.track.name if trial.track is not None else "a table"
-        return f"{trial.name} came as a track ({name}): there is no recording to show, only the positions of its edge."
+        return f"{trial.name} came as a track ({name}): there is no recording to show."
     if not trial.video.exists():
-        return f"The recording of {trial.name}, {trial.video.name}, no longer exists; its track is shown instead."
+        return f"The recording of {trial.name}, {trial.video.name}, no longer exists."
     try:
         axis = read_json(results.analysed(trial.name)).get("axis")
         table = read_result(results.track(trial.name))
@@ -420,7 +420,7 @@ class FilmPanel:
         self._reference: Prediction | None = None
         self._film: Film | None = None
         self._job: Job[tuple[int, float], Film] | None = None
-        self._view: RecordingView | str = ""
+        self._view: RecordingView | None = None
         self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
         self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial")
@@ -472,22 +472,16 @@ class FilmPanel:
         if self.trial_select.value != name:
             self.trial_select.value = name
             return
-        self.figure.visible = False
-        view = self._view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
+        self.figure.visible = self.play.visible = self.frame.visible = False
+        view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
         if isinstance(view, str):
-            self._show_track(view)
+            self.caption.text = f"<p>{escape(view)}</p>"
             return
+        self._view = view
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
         soon = self._document.add_next_tick_callback
         decoding, decoded = partial(self._decoding, view), partial(self._decoded, view)
         self._job = Job(partial(decode, view.path), lambda done: soon(partial(decoding, *done)), decoded, soon)
-
-    def _show_track(self, reason: str) -> None:
-        """Show the positions alone, and why there is no recording."""
-        self._view = reason
-        data = self._shown.data
-        last = max(data.time_s.size - 1, 1)
-        self._show_from(last, (data.n_rest + last) // 2)
 
     def _decoding(self, view: RecordingView, count: int, share: float) -> None:
         if view is self._view and self._job is not None:
@@ -496,20 +490,19 @@ class FilmPanel:
     def _decoded(self, view: RecordingView, film: Film | None, reason: str) -> None:
         self._job, self._film = None, film
         if film is None:
-            self._show_track(reason)
+            self.caption.text = f"<p>{escape(reason)}</p>"
             return
         height, width = film.picture(0).shape
         self.figure.x_range.update(start=-0.5, end=width - 0.5)
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
         self._image.glyph.update(dw=width, dh=height)
-        self.figure.update(aspect_ratio=width / height, visible=True)
+        self.figure.aspect_ratio = width / height
+        self.figure.visible = self.play.visible = self.frame.visible = True
         known = np.flatnonzero(view.track["edge_px"].notna())
         last = len(film.frames) - 1
-        self._show_from(last, int(min(known[known.size // 2], last)) if known.size else 0)
-
-    def _show_from(self, last: int, frame: int) -> None:
-        """Show the first frame of a trial that is shown: half-way along its motion."""
-        self.frame.update(start=0, end=max(last, 1), value=frame)
+        # The first frame that is shown: half-way along the motion
+        middle = int(min(known[known.size // 2], last)) if known.size else 0
+        self.frame.update(start=0, end=max(last, 1), value=middle)
         self._show_frame()
 
     def _show_frame(self) -> None:
@@ -525,9 +518,9 @@ class FilmPanel:
     def _show_edges(self) -> None:
         """Draw each of `EDGES` that is known in the frame shown, and state their positions below."""
         aligned, view, frame = self._shown, self._view, int(self.frame.value)
-        time_s, measured_m = aligned.data.time_s, aligned.data.lead_position_m
-        if isinstance(view, RecordingView):
-            time_s, measured_m = (view.track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+        if view is None or self._film is None:
+            return
+        time_s, measured_m = (view.track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
         at_s = float(time_s[min(frame, time_s.size - 1)])
         positions_m = np.full(3, math.nan)
         if frame < measured_m.size:
@@ -542,21 +535,19 @@ class FilmPanel:
             for (name, colour, _), m in zip(EDGES, positions_m, strict=True)
             if math.isfinite(m)
         ]
-        if isinstance(view, RecordingView) and frame < len(view.track):
+        if frame < len(view.track):
             if with_flag(view.track["flag"], "corrected")[frame]:
                 said.append("corrected by hand")
             along_px = view.along_px(positions_m)
             along_px[0] = view.track["edge_px"].iloc[frame]
-            self._draw_lines(view, frame, along_px)
-        notice = f"<p>{escape(view)}</p>" if isinstance(view, str) else ""
+            self._draw_lines(view, self._film.scale, frame, along_px)
         since_s = at_s - aligned.release_s
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
-        self.caption.text = f"{notice}<p>{when} · {' · '.join(said)}</p>"
+        self.caption.text = f"<p>{when} · {' · '.join(said)}</p>"
         self._instant(since_s)
 
-    def _draw_lines(self, view: RecordingView, frame: int, along_px: Floats) -> None:
+    def _draw_lines(self, view: RecordingView, scale: float, frame: int, along_px: Floats) -> None:
         """Draw a line across the vine for each of `EDGES`; the picture may be smaller than the recording."""
-        scale = 1.0 if self._film is None else self._film.scale
         lines: Columns = {"xs": [], "ys": [], "colour": [], "dash": []}
         for (name, colour, dash), px in zip(EDGES, along_px, strict=True):
             if math.isfinite(px) and not (name == "comparison" and self._reference is self._now):
@@ -588,4 +579,4 @@ class FilmPanel:
         """Stop decoding, and let the recording go."""
         if self._job is not None:
             self._job.cancel()
-        self._job, self._film, self._view = None, None, ""
+        self._job, self._film, self._view = None, None, None
