@@ -25,6 +25,7 @@ import typer
 
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
+from vinetrack.core.terminal import print_line
 from vinetrack.experiment.schema import COLUMNS, CellError, Column, option
 
 # ------------------------------------------------------------------------------
@@ -36,17 +37,6 @@ START, MORE = "Start here", "More"  # Panels of the help; the first lists the co
 def json_to_terminal(json_file: Path | None) -> bool:
     """Whether JSON is printed to the terminal instead of lines."""
     return json_file == STANDARD_OUTPUT
-
-
-def _say(line: str, err: bool = False) -> None:
-    """Print a line; on a terminal that wants colours, `error` and `warning` at its beginning have theirs."""
-    from rich.console import Console
-    from rich.text import Text
-
-    text = Text(line)
-    text.highlight_regex("^error(?=:)", "bold red")
-    text.highlight_regex("^warning(?=:)", "bold yellow")
-    Console(stderr=err).print(text, soft_wrap=True)
 
 
 @contextmanager
@@ -96,7 +86,7 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
 
 def _exit_with(message: str) -> None:
     for line in message.splitlines():
-        _say(line, err=True)
+        print_line(line, err=True)
     raise typer.Exit(1)
 
 
@@ -139,7 +129,7 @@ def command(
             log, json_file = values.pop("log", None), values.get("json")
             with errors_as_sentences(log):
                 with progress_line() as report:
-                    tools = {"say": partial(_say, err=json_to_terminal(json_file)), "report": report}
+                    tools = {"say": partial(print_line, err=json_to_terminal(json_file)), "report": report}
                     named = {name: value for name, value in {**values, **tools}.items() if name in wanted}
                     if "options" in wanted:
                         options = {name: value for name, value in values.items() if name not in {*wanted, "json"}}
@@ -148,7 +138,7 @@ def command(
                 if answer is not None:
                     lines, content, *failed = answer
                     for text in () if json_to_terminal(json_file) else lines:
-                        _say(text)
+                        print_line(text)
                     if json_file is not None and content is not None:
                         write_json(json_file, content)
                     if any(failed):

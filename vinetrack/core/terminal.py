@@ -21,6 +21,17 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
+def print_line(line: str, err: bool = False) -> None:
+    """Print a line; on a terminal that wants colours, `error` and `warning` at its beginning have theirs."""
+    from rich.console import Console
+    from rich.text import Text
+
+    text = Text(line)
+    text.highlight_regex("^error(?=:)", "bold red")
+    text.highlight_regex("^warning(?=:)", "bold yellow")
+    Console(stderr=err).print(text, soft_wrap=True)
+
+
 def table(
     rows: Iterable[Sequence[object]],
     header: Sequence[str] = (),
