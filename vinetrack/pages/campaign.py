@@ -67,26 +67,20 @@ class ExplorerTrial:
 
     @cached_property
     def rows(self) -> slice:
-        """The frames to draw: from the end of the rest."""
-        released = int(np.searchsorted(self.data.time_s, self.release_s))
-        return drawn_rows(self.time_s.size, min(released, max(self.data.n_rest - 1, 0)))
-
-
-def drawn_rows(count: int, first: int) -> slice:
-    """Return the rows to draw of `count`, from a little before the `first` of the motion: rest would take most of a
-    figure, and points closer than a pixel need not be sent.
-    """
-    first = min(first, count - 1)
-    begin = max(first - max((count - first) // 20, 2), 0)
-    # 250: points of a line; chosen: one per three or four pixels
-    return slice(begin, None, max(math.ceil((count - begin) / 250), 1))
+        """The frames to draw, from a little before the end of the rest: rest would take most of a figure, and points
+        closer than a pixel need not be sent.
+        """
+        count = self.time_s.size
+        first = min(int(np.searchsorted(self.data.time_s, self.release_s)), max(self.data.n_rest - 1, 0), count - 1)
+        begin = max(first - max((count - first) // 20, 2), 0)
+        # 250: points of a line; chosen: one per three or four pixels
+        return slice(begin, None, max(math.ceil((count - begin) / 250), 1))
 
 
 @dataclass(frozen=True)
 class Campaign:
     """A results folder with its experiment, read by `read_campaign`. `stored` is its fit; `in_use` are the effects of
-    the model that the results are of. `bands` are time, mean and standard deviation of the replicates of a condition,
-    shape (3, n_times).
+    the model that the results are of.
     """
 
     folder: Path
@@ -94,7 +88,6 @@ class Campaign:
     pairs: tuple[tuple[Trial, Track], ...]
     trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
-    bands: Mapping[str, Floats]
     highest_m: Mapping[str, float]
     expected_m: tuple[float, ...]
     stored: FitSummary
@@ -165,13 +158,6 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         highest_m = dict(zip(table["condition"], table["expected_high_m"], strict=True))
     compared = {name: read_result(results.trajectories(name)) for name in highest_m}
     ladder = read_result(results.ladder)[EXPECTED].to_numpy(dtype=float).tolist() if results.ladder.exists() else []
-    bands = {}
-    for condition, table in compared.items():
-        # The replicates at the times of the longest trial of each condition, where they are known
-        longest = table.groupby("trial")["time_s"].max().idxmax()
-        columns = ["time_s", "replicates_mean_m", "replicates_sigma_m"]
-        rows = table.loc[table["trial"] == longest, columns].to_numpy(dtype=float)
-        bands[condition] = rows[np.isfinite(rows[:, 1:]).all(axis=1)].T
     effects, unusable = {**catalogue(), **user_effects}, {}
     for effect in effects.values():
         try:
@@ -184,7 +170,6 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         pairs=tuple(pairs),
         trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
-        bands=bands,
         highest_m=highest_m,
         expected_m=tuple(ladder[0]) if ladder else (math.nan,) * 3,
         stored=stored,

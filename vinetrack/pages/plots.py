@@ -42,7 +42,7 @@ from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.figures.registry import features
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, drawn_rows
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import TEMPLATES, jpeg
 from vinetrack.pipeline.overlays_stage import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
@@ -170,7 +170,6 @@ class Plots:
         styles = vine_styles(campaign.vines)
         # The colour of each condition is that of its vine, as in every figure.
         self._colour = {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
-        self._band = ColumnDataSource(self._replicate_bands(()))
         self._measured = ColumnDataSource(self._lines(()))
         self._reference = ColumnDataSource({"xs": [], "ys": []})
         self._model = ColumnDataSource({"xs": [], "ys": []}, name="model_curves")
@@ -181,7 +180,6 @@ class Plots:
 
     def _draw_motion(self) -> Any:
         fig = plot(360, "since release (ms)", "growth (mm)", name="motion")
-        fig.patches("xs", "ys", source=self._band, fill_color=vine_colour(), fill_alpha=0.2, line_color=None)
         look = {"line_color": vine_colour(), "line_width": 1.6, "line_alpha": 0.9}
         lines = fig.multi_line("xs", "ys", source=self._measured, **look)
         for of_axis in (fig.x_range, fig.y_range):
@@ -250,20 +248,6 @@ class Plots:
             columns["condition"].append(self.campaign.labels[aligned.condition])
         return columns
 
-    def _replicate_bands(self, conditions: Sequence[str]) -> Columns:
-        """Outlines of one standard deviation of the replicates around their mean, ms and mm."""
-        columns: Columns = {"xs": [], "ys": [], "colour": []}
-        for condition in conditions:
-            band = self.campaign.bands.get(condition)
-            if band is None or band.shape[1] < 2:
-                continue
-            rows = drawn_rows(band.shape[1], int(np.searchsorted(band[0], 0.0)))
-            time_ms, mean_mm, sigma_mm = 1e3 * band[:, rows]
-            columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
-            columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
-            columns["colour"].append(self._colour[condition])
-        return columns
-
     def _model_lines(self, prediction: Prediction, shown: Sequence[int]) -> Columns:
         """One line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
         longest: dict[str, tuple[ExplorerTrial, TrialFit]] = {}
@@ -289,11 +273,8 @@ class Plots:
 
     def set_shown(self, shown: Sequence[int]) -> None:
         """Select the trials to draw."""
-        trials = [self.campaign.trials[i] for i in shown]
+        trials = (self.campaign.trials[i] for i in shown)
         self._measured.data = self._lines((aligned, aligned.time_s, aligned.growth_m) for aligned in trials)
-        conditions = [name for name in self.campaign.conditions if name in {one.condition for one in trials}]
-        # Chosen: bands of more than four conditions overlap and hide the curves
-        self._band.data = self._replicate_bands(conditions if len(conditions) <= 4 else [])
 
     def set_instant(self, since_s: float) -> None:
         """Mark a time since release."""
