@@ -128,12 +128,6 @@ class Campaign:
         """One model with all effects, as in a diagnosis: its compiled form serves every model that can be chosen."""
         return host_for(Model(()), self.effects.values())
 
-    def own_files(self, names: Sequence[str]) -> list[str]:
-        """Return the files of user effects in the experiment's folder, of those named."""
-        folder = self.experiment.folder.resolve()
-        paths = [self.effects[name].path for name in names]
-        return [path.name for path in paths if path.resolve().parent == folder]
-
     def indices_of_condition(self, condition: str) -> list[int]:
         """Return the indices of the trials of a condition in `trials`."""
         return [i for i, aligned in enumerate(self.trials) if aligned.condition == condition]
@@ -443,10 +437,9 @@ class BackgroundFit:
     new result or step.
     """
 
-    def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
+    def __init__(self, campaign: Campaign) -> None:
         self.campaign = campaign
         self.initial = choice_in_use(campaign)
-        self.opening_choice = choice or self.initial
         self.prediction: Prediction | None = None
         self.fitted: Evaluated | None = None
         self.step: Step | None = None

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bokeh.models import (
     Checkbox,
     CheckboxButtonGroup,
     Column,
-    ColumnDataSource,
     CustomJS,
     Div,
     PrintfTickFormatter,
@@ -22,17 +22,14 @@ from bokeh.models import (
 
 from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.diagnosis.result import UNEXPLAINED
-from vinetrack.effects import BASE_EFFECTS, load_effect
+from vinetrack.effects import BASE_EFFECTS
 from vinetrack.inference.fit_result import Number, number_row
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.campaign import (
-    BackgroundFit,
     Campaign,
     Job,
     ModelChoice,
     SizeControl,
-    choice_in_use,
-    read_campaign,
     sizes_of,
     slider_range,
 )
@@ -183,52 +180,28 @@ class TrialSelector:
 
 
 # ------------------------------------------------------------------------------
-# If no known effect explains the misfit: a button that proposes an effect, and one that opens the page with it.
-
-Reopen = Callable[[BackgroundFit], None]  # Makes pages opened from now on show another campaign
+# If no known effect explains the misfit: a button that proposes an effect.
 
 PROPOSE = "Propose an effect"
-
-
-def propose_and_read(
-    campaign: Campaign, on_progress: Callable[[str], None]
-) -> tuple[Sequence[str], BackgroundFit | None]:
-    """Propose an effect and write it to the experiment's folder; return what is said of it, and the campaign read anew
-    with the first of its files (the law, if there is one) in the model, if there are files.
-    """
-    lines, files = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
-    proposed = {effect.name: effect for effect in map(load_effect, files)}
-    if not proposed:
-        return lines, None
-    known = {name: effect for name, effect in campaign.effects.items() if name not in proposed}
-    read = read_campaign(campaign.folder, campaign.experiment, known | proposed)
-    return lines, BackgroundFit(read, choice_in_use(read).with_effect(next(iter(proposed))))
 
 
 class ProposalPanel:
     """Button, progress and outcome; visible if the verdict is `unexplained`."""
 
-    def __init__(self, page: Page, reopen: Reopen) -> None:
-        self._page, self._reopen = page, reopen
-        self._job: Job[str, tuple[Sequence[str], BackgroundFit | None]] | None = None
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._job: Job[str, tuple[list[str], list[Path]]] | None = None
         self._task, self._begun_s = "", 0.0
-        self._proposed: BackgroundFit | None = None
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
-        self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         command = f"vinetrack propose {page.campaign.folder.as_posix()}"
         self.text = Div(text=panel("propose", line=command), name="proposal")
-        self._reload = ColumnDataSource({"times": [0]}, name="reload")
-        self._reload.js_on_change("data", CustomJS(code="location.reload()"))
-        buttons = beside(self.button, self.open)
-        self.root = Column(self.text, buttons, name="propose_panel", tags=[self._reload])
-        self.show()
-
-    def show(self) -> None:
-        """Update after a change of the diagnosis, and as time passes."""
-        diagnosis, unexplained = self._page.diagnosis, False
+        diagnosis, unexplained = page.diagnosis, False
         if diagnosis is not None and not diagnosis.contradicted_columns:
             unexplained = UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
-        self.root.visible = self._job is not None or self._proposed is not None or unexplained
+        self.root = Column(self.text, self.button, name="propose_panel", visible=unexplained)
+
+    def show(self) -> None:
+        """Update the progress as time passes."""
         if self._job is not None:
             passed_s = time.monotonic() - self._begun_s
             # 75 s: time in which the progress bar of a search is half full (chosen)
@@ -245,22 +218,17 @@ class ProposalPanel:
             self._done(None, "The search was stopped; nothing was written.")
             return
         self._task, self._begun_s, self.button.label = "reading the results", time.monotonic(), "Stop"
-        soon = self._page.document.add_next_tick_callback
-        self._job = Job(partial(propose_and_read, self._page.campaign), self._on_progress, self._done, soon)
+        campaign, soon = self._page.campaign, self._page.document.add_next_tick_callback
+        search = partial(propose_effect, campaign.experiment, campaign.folder, None)
+        self._job = Job(search, self._on_progress, self._done, soon)
         self.show()
 
     def _on_progress(self, task: str) -> None:
         """Called from the job's thread; the status line shows it."""
         self._task = task
 
-    def _done(self, outcome: tuple[Sequence[str], BackgroundFit | None] | None, reason: str) -> None:
+    def _done(self, outcome: tuple[list[str], list[Path]] | None, reason: str) -> None:
         self._job, self.button.label = None, PROPOSE
-        lines, self._proposed = outcome or ([reason], None)
-        self.open.visible = self._proposed is not None
-        self.button.visible = not self.open.visible
+        lines, files = outcome or ([reason], [])
+        self.button.visible = not files
         set_text(self.text, "".join(f"<p>{escape(line)}</p>" for line in lines))
-
-    def _open(self) -> None:
-        if self._proposed is not None:
-            self._reopen(self._proposed.begin())
-            self._reload.data = {"times": [1]}

@@ -40,7 +40,7 @@ from vinetrack.pages.campaign import (
     predict_choice,
     read_campaign,
 )
-from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, TrialSelector
+from vinetrack.pages.controls import EffectPanel, ProposalPanel, TrialSelector
 from vinetrack.pages.local_page import TEMPLATES, PageServer
 from vinetrack.pages.plots import (
     FilmPanel,
@@ -149,9 +149,9 @@ TEXT_MS = 150
 class Page:
     """Controller of one document. `_on_background_change` and `_on_step` are called from other threads."""
 
-    def __init__(self, background: BackgroundFit, document: Document, reopen: Reopen) -> None:
+    def __init__(self, background: BackgroundFit, document: Document) -> None:
         self.background, self.campaign, self.document = background, background.campaign, document
-        self.choice: ModelChoice = background.opening_choice
+        self.choice: ModelChoice = background.initial
         self.shown: Prediction | None = None
         self.fits: list[Evaluated] = []
         self.held: tuple[Prediction, dict[str, str]] | None = None
@@ -163,7 +163,7 @@ class Page:
         self._job: Job[Step, Evaluated] | None = None
         self._begun_s, self._message = 0.0, ""
         self._step: Step | None = None
-        self._build(reopen)
+        self._build()
         background.listeners.append(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
         document.add_periodic_callback(self._update_status, 200)  # Chosen: the status line shows tenths of a second
@@ -171,7 +171,7 @@ class Page:
 
     # ---- layout ----------------------------------------------------------------------------------------------------
 
-    def _build(self, reopen: Reopen) -> None:
+    def _build(self) -> None:
         campaign = self.campaign
         self.headline, self.status = Div(name="headline"), Div(name="status")
         self.numbers, self.tied, self.next = Div(name="numbers"), Div(name="tied"), Div(name="next")
@@ -181,7 +181,7 @@ class Page:
         self.film = FilmPanel(campaign, self.document, self.plots.set_instant)
         self.saved = Div(name="saved")
         save = beside(button("Save the model to experiment.yaml", "save", self._save))
-        self.proposal = ProposalPanel(self, reopen)
+        self.proposal = ProposalPanel(self)
         self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
@@ -305,8 +305,6 @@ class Page:
         self._update_text()
         worst = max(first.errors_m, key=lambda name: first.errors_m[name])
         self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
-        if self.choice is not self.background.initial:
-            self._mark_changed()
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread; the status line shows it."""
@@ -404,7 +402,7 @@ class Page:
     def _save(self) -> None:
         folder, effects = self.campaign.experiment.folder, self.choice.effects
         try:
-            path = save_model(folder, effects, self.campaign.own_files(effects))
+            path = save_model(folder, effects)
         except (ExperimentError, TableError, OSError) as error:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
@@ -428,11 +426,10 @@ class Page:
 
 def start_server(background: BackgroundFit, port: int | None = None) -> PageServer:
     """Return the server of the page, which answers once its loop runs."""
-    shown = [background]
 
     def application(secret: str) -> BokehTornado:
         made = BokehTornado(
-            lambda document: Page(shown[-1], document, shown.append),
+            lambda document: Page(background, document),
             prefix=secret,
             extra_websocket_origins=["*"],  # checked by the server, with all else
             use_index=False,
