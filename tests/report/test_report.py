@@ -281,14 +281,14 @@ def test_the_page_shows_comparison_numbers_check_and_warnings():
     assert "1 rule for neglecting terms is violated" in text
 
 
-# The section on the paper's numbers: both tables, every row, and the explanation of the marks.
+# The section on the paper's numbers: Table II, every row, and the explanation of the marks.
 def test_table_two_sets_departures_beside_the_errors():
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
     named = zip(DEPARTURES, (0.057, 0.069, 0.095, 0.110, 0.114), strict=True)
     departures = [("Fig. 4", 7.0, one.name, size, math.nan, math.nan) for one, size in named]
     table = pd.DataFrame(departures, columns=list(DEPARTURE_COLUMNS))
-    positions, speeds = build.paper_section(as_table([row]), table, [])["tables"][1:3]
+    positions, speeds = build.paper_section(as_table([row]), table, [])["tables"][:2]
     assert positions.rows[0] == ("7", "1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
     assert positions.rows[1] == ("14", "0.29", "–", "–", "–", "–")
     assert [row[:2] for row in speeds.rows] == [("14", "0.27"), ("28", "0.56"), ("41", "1.35")]

@@ -336,7 +336,7 @@ def law_rows(laws: pd.DataFrame | None) -> list[tuple[str, ...]]:
 
 
 # ------------------------------------------------------------------------------
-# Section of the report that compares the paper's numbers with ours: Tables I and II, `paper.csv`, figures.
+# Section of the report that compares the paper's numbers with ours: Table II, `paper.csv`, figures.
 
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> dict[str, Any]:
@@ -356,7 +356,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
             "have absorbed a part of it.",
         ],
-        "tables": [table_one(by_row), *table_two(by_row, departures), every_row(table)],
+        "tables": [*table_two(by_row, departures), every_row(table)],
         "figures": figures,
     }
 
@@ -368,21 +368,6 @@ def tally(table: pd.DataFrame) -> str:
     counts = table["mark"].value_counts()
     parts = [f"{counts[mark]} {mark}" for mark in MARKS if counts.get(mark, 0)]
     return f"{len(table)} rows: {', '.join(parts)}."
-
-
-def table_one(by_row: Mapping[str, Any]) -> ReportTable:
-    """Return Table I of the paper, with the results of Fig. 6 and ours."""
-    head = (
-        *("R", "wall, µm", "diameter, mm", "heat press, °C", "laser, %"),
-        *("B printed, N·(s/m)ⁿ", "B here (95 %)", "R² printed", "R² here"),
-    )
-    body = []
-    for scale, B in published.DAMPING_B.items():
-        made = [by_row.get(f"{name}_R{scale}") for name in ("thickness", "diameter", "press", "laser")]
-        R2 = f"{published.DAMPING_R2[scale]:g}", number(_value(by_row.get(f"R2_R{scale}")))
-        printed = [_shown(_value(row, "published")) for row in made]
-        body.append((str(scale), *printed, f"{B:g}", _ours(by_row.get(f"B_R{scale}")), *R2))
-    return ReportTable("Table I, with the results of Fig. 6", head, body, frozenset(range(1, len(head))))
 
 
 def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[ReportTable]:
@@ -407,7 +392,8 @@ def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[Repor
         body = []
         for kPa, error in printed.items():
             of_figure = departures[(departures["figure"] == figure) & np.isclose(departures["pressure_kPa"], kPa)]
-            cells = [f"{kPa:g}", f"{error:g}", number(_value(by_row.get(f"{row}_{kPa:g}kPa")))]
+            found = by_row.get(f"{row}_{kPa:g}kPa")
+            cells = [f"{kPa:g}", f"{error:g}", number(None if found is None else float(found.ours))]
             for names in causes.values():
                 sizes = sorted(factor * of_figure.loc[of_figure["departure"].isin(names), column])
                 cells.append(" to ".join(dict.fromkeys(map(number, sizes))) or "–")  # the same size once
@@ -427,21 +413,12 @@ def every_row(table: pd.DataFrame) -> ReportTable:
     return ReportTable("Every number", head, body, frozenset({2, 3}))
 
 
-def _value(row: Any, column: str = "ours") -> float | None:
-    return None if row is None else float(getattr(row, column))
-
-
 def _ours(row: Any) -> str:
-    if row is None or not math.isfinite(row.ours):
+    if not math.isfinite(row.ours):
         return "–"
-    bounds = interval((row.ours_low_95, row.ours_high_95))
-    return f"{_shown(row.ours)} ({bounds})" if bounds != "–" else _shown(row.ours)
-
-
-def _shown(value: float | None) -> str:
-    """A number to three digits; integers are unchanged."""
-    whole = value is not None and math.isfinite(value) and math.isclose(value, round(value), rel_tol=1e-9)
-    return f"{value:.0f}" if whole else number(value)
+    whole = math.isclose(row.ours, round(row.ours), rel_tol=1e-9)
+    shown, bounds = f"{row.ours:.0f}" if whole else number(row.ours), interval((row.ours_low_95, row.ours_high_95))
+    return f"{shown} ({bounds})" if bounds != "–" else shown
 
 
 # ------------------------------------------------------------------------------
