@@ -199,11 +199,11 @@ def test_a_block_is_cleared_and_what_cannot_be_set_without_harm_is_refused():
         with_value("a: &x {p: 1}\nb: *x\n", "b", {"p": 2})
 
 
-def test_a_model_is_saved_and_a_broken_file_is_left_as_it_is(tmp_path):
+def test_line_ends_and_the_mark_at_the_beginning_stay_and_a_broken_file_is_left_as_it_is(tmp_path):
     path = tmp_path / "experiment.yaml"
     path.write_bytes(b"\xef\xbb\xbfchamber_l: 2\r\nmodel: [gravity]\r\n")
     save_model(tmp_path, ["gravity", "air_drag"])
-    assert path.read_bytes() == b"chamber_l: 2\nmodel: [gravity, air_drag]\n"
+    assert path.read_bytes() == b"\xef\xbb\xbfchamber_l: 2\r\nmodel: [gravity, air_drag]\r\n"
     path.write_text("model: [gravity\n")
     with pytest.raises(ExperimentError):
         save_model(tmp_path, ["gravity", "leak"])

@@ -373,25 +373,33 @@ def read_yaml(path: Path) -> YamlDocument:
 def parse_yaml(text: str, file: str) -> YamlDocument:
     """Parse YAML text; see `read_yaml`."""
     from ruamel.yaml import YAML
-    from ruamel.yaml.constructor import DuplicateKeyError
     from ruamel.yaml.error import YAMLError
 
+    lines: dict[tuple[Any, ...], int] = {}
+    problems: list[Problem] = []
+    content: Any = {}
     try:
         yaml = YAML(typ="safe", pure=True)
         document = yaml.compose(text)
-        content = {} if document is None else yaml.constructor.construct_document(document)
-        lines = dict(_places(document))
+        for path, line in _places(document):
+            if path in lines and path[-1] != "<<" and isinstance(path[-1], str):
+                remedy, key = f"keep one; the first is on line {lines[path]}", ".".join(map(str, path))
+                problems.append(Problem(message="is set twice", file=file, line=line, column=key, remedy=remedy))
+            lines[path] = line
+            if len(lines) > 10_000:  # largest document (chosen): nested aliases can expand beyond the memory
+                raise ValueError("too large")
+        if document is not None and not problems:
+            content = yaml.constructor.construct_document(document)
     except (YAMLError, RecursionError, ValueError, ArithmeticError, TypeError, LookupError, AttributeError) as error:
         reason = getattr(error, "problem", None) or "it cannot be understood"
         mark = getattr(error, "problem_mark", None)
         remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
-        key, remedy = (reason.split('"')[1], "keep one") if isinstance(error, DuplicateKeyError) else ("", remedy)
         line = mark.line + 1 if mark is not None else 0
-        problem = Problem(message=f"is not YAML ({reason})", column=key, file=file, line=line, remedy=remedy)
-        raise ExperimentError([problem]) from None
+        problems = [Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)]
     if not isinstance(content, dict | None):
-        remedy = "write lines such as 'key: value'"
-        raise ExperimentError([Problem(message="holds no settings", file=file, remedy=remedy)])
+        problems = [Problem(message="holds no settings", file=file, remedy="write lines such as 'key: value'")]
+    if problems:
+        raise ExperimentError(problems)
     return YamlDocument(content or {}, lines)
 
 
@@ -399,6 +407,8 @@ def _places(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, 
     """Yield the path of every key and element below a node, and its line."""
     from ruamel.yaml.nodes import MappingNode, SequenceNode
 
+    if len(path) > 20:  # deepest document (chosen)
+        raise ValueError("too large")
     for i, entry in enumerate(node.value if isinstance(node, MappingNode | SequenceNode) else ()):
         first, inner = entry if isinstance(node, MappingNode) else (entry, entry)
         name = i if first is inner else first.value if isinstance(first.value, str) else "?"
@@ -451,8 +461,11 @@ def _edited(old: Any, value: Any) -> Any:
         elements = old if isinstance(old, CommentedSeq) else CommentedSeq()
         if elements is not old:
             elements.fa.set_flow_style()
-        while elements != value[: len(elements)]:
-            del elements[len(elements) - 1]
+        for i in reversed(range(len(elements))):
+            if elements[i] not in value:
+                del elements[i]
+        if elements != value[: len(elements)]:
+            elements.clear()
         elements.extend(_edited(None, element) for element in value[len(elements) :])
         return elements
     return value

@@ -92,7 +92,8 @@ class EffectError(UserError, ValueError):
 
 
 # What an effect may import. It is one file, so that the hash of its text stands for it wherever it lies.
-_IMPORTED = {"__future__", "math", "numba", "numpy", "scipy", "typing", "vinetrack"}
+_STANDARD = "__future__ collections dataclasses functools itertools math typing"
+_IMPORTED = {*_STANDARD.split(), "numba", "numpy", "scipy", "vinetrack"}
 
 
 def _load_module(path: Path) -> ModuleType:
