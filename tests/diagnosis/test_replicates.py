@@ -231,7 +231,8 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
         force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
         named = [{"name": str(k), "vine": str(k % 6), "condition": str(k)} for k in range(24)]
         trials = [
-            SimpleNamespace(travel_ratio=2, area_m2=1.0, force_N=force_N[k], **names) for k, names in enumerate(named)
+            SimpleNamespace(travel_ratio=2, area_m2=1.0, pressure_unit="kPa", force_N=force_N[k], **names)
+            for k, names in enumerate(named)
         ]
         speeds = np.exp(log_speed).tolist()
         both = zip(speeds, trials, strict=True)

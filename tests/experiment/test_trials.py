@@ -204,6 +204,7 @@ def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
     assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "warning")}
     assert said.keys() == {"diameter_in", "pressure_psi", "payload_oz", "yield_pressure_psi"}
     assert "6.89476" in said["pressure_psi"].message
+    assert (trial.pressure_in_words(), trial.condition.split("_")[1]) == ("4 psi (27.6 kPa)", "4psi")
     assert (said["yield_pressure_psi"].file, said["yield_pressure_psi"].line) == ("experiment.yaml", 1)
 
 

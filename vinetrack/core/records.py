@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3, pressure_text
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -86,6 +86,7 @@ class Trial:
     thickness_m: float = math.nan
     length_m: float = math.nan
     pressure_Pa: float = math.nan
+    pressure_unit: str = "kPa"  #: that of the sheet, in which people read the pressure
     pressure_sigma_Pa: float = math.nan
     yield_pressure_Pa: float = math.nan
     yield_pressure_sigma_Pa: float = math.nan
@@ -117,6 +118,10 @@ class Trial:
         if shared in ("vine", "specimen"):
             return f"{self.vine}, {self.specimen}" if shared == "specimen" and self.specimen else self.vine
         return f"{shared} {value}" if (value := getattr(self, shared, "")) else ""
+
+    def pressure_in_words(self, digits: int = 3) -> str:
+        """Return the pressure as the sheet states it, with its unit."""
+        return pressure_text(self.pressure_Pa, self.pressure_unit, digits)
 
     @property
     def area_m2(self) -> float:

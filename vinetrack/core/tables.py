@@ -20,7 +20,7 @@ import re
 import unicodedata
 import uuid
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -134,7 +134,7 @@ class TableError(InputError):
 class Table:
     """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank or if the line is
     short); `lines[i]` is its line in the file, from 1; `extra[i]` holds the cells beyond the last column; `nameless`: a
-    column without a name has content.
+    column without a name has content; `units`: of the columns that were converted from another unit.
     """
 
     columns: tuple[str, ...]
@@ -144,6 +144,7 @@ class Table:
     delimiter: str
     decimal: str
     nameless: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
         """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error. Shape (n_rows,)."""

@@ -172,3 +172,13 @@ def convert(value: float, unit: str, to: str) -> float:
         raise ValueError(f"{given.text} cannot be turned into {wanted.text}")
     # One product of both factors avoids the rounding of an intermediate SI value: 1 in is exactly 25.4 mm.
     return value * (given.multiply * wanted.divide) / (given.divide * wanted.multiply)
+
+
+def pressure_text(pressure_Pa: float, unit: str = "kPa", digits: int = 3) -> str:
+    """Return a pressure in the unit that the user's sheet has, with kPa beside any other.
+
+    >>> pressure_text(34474.0), pressure_text(34474.0, "psi")
+    ('34.5 kPa', '5 psi (34.5 kPa)')
+    """
+    shown = f"{pressure_Pa / 1e3:.{digits}g} kPa"
+    return shown if unit == "kPa" else f"{UNITS[unit].from_si(pressure_Pa):.{digits}g} {UNITS[unit].text} ({shown})"

@@ -57,6 +57,7 @@ class Failure:
     """
 
     model: str
+    pressure_unit: str
     by_condition: pd.DataFrame
     along_time: pd.DataFrame
     along_position: pd.DataFrame
@@ -76,7 +77,7 @@ class Failure:
 
     def remarks(self) -> tuple[Remark, ...]:
         """Where the model fails most, by how much, and what drifts."""
-        return (*_where(self.by_condition, self.fails), *self.drift.remarks)
+        return (*_where(self.by_condition, self.fails, self.pressure_unit), *self.drift.remarks)
 
 
 def locate(fit: Fit) -> Failure:
@@ -90,6 +91,7 @@ def locate(fit: Fit) -> Failure:
     in_time = [(of, common_edges(of), name) for name, of in conditions.items()]
     return Failure(
         model="+".join(fit.model.names),
+        pressure_unit=predicted[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_time=_table("time_s", "s", in_time, scatter),
         along_position=_table("lead_position_m", "m", _parts("lead_position_m", courses), scatter),
@@ -176,24 +178,24 @@ def _table(along: str, unit: str, parts: Sequence[Part], scatter: Scatter) -> pd
     return pd.DataFrame(rows, columns=list(columns))
 
 
-def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
+def _where(table: pd.DataFrame, fails: bool, unit: str) -> Iterator[Remark]:
     """Remarks about conditions; the table has the worst first."""
     if not fails:
         worst = table.sort_values("z").iloc[-1]
-        yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=_named(worst, table))
+        yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=_named(worst, table, unit))
         return
     worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
     numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")}
-    yield remark("fails_most", condition=_named(worst, table), **numbers)
+    yield remark("fails_most", condition=_named(worst, table, unit), **numbers)
     # 2.0: significance, in standard deviations, from which it is said to fail in a condition
     count, total = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum()), len(table)
     yield remark("fails_in", count=count, total=total)
 
 
-def _named(row: pd.Series, table: pd.DataFrame) -> dict[str, object]:
+def _named(row: pd.Series, table: pd.DataFrame, unit: str) -> dict[str, object]:
     """What names a condition: its pressure, and payload and vine where they vary."""
     varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
-    return {name: row[name] for name in ("pressure_Pa", *varying)}
+    return {"unit": unit} | {name: row[name] for name in ("pressure_Pa", *varying)}
 
 
 # ------------------------------------------------------------------------------

@@ -59,13 +59,14 @@ FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen
 
 @dataclass(frozen=True)
 class OddTrial:
-    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa. `implied_pressure_Pa`
-    is NaN where it is not known.
+    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa, and the unit of the
+    sheet. `implied_pressure_Pa` is NaN where it is not known.
     """
 
     name: str
     stated_Pa: float
     implied_pressure_Pa: float
+    unit: str = "kPa"
 
 
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
@@ -117,7 +118,10 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
         return []
     expected_N = np.where(np.isin(of_vine, vines), np.exp(curves @ fitted.x), math.nan)
     implied_Pa = [stated_Pa[k] + (expected_N[k] - force_N[k]) / trials[k].area_m2 for k in odd]
-    return [OddTrial(trials[k].name, stated_Pa[k], float(Pa)) for k, Pa in zip(odd, implied_Pa, strict=True)]
+    return [
+        OddTrial(trials[k].name, stated_Pa[k], float(Pa), trials[k].pressure_unit)
+        for k, Pa in zip(odd, implied_Pa, strict=True)
+    ]
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:

@@ -259,7 +259,8 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     named = []
     for trial in trials:
         vine = _vine(trial)
-        parts = [vine, f"{_digits(trial.pressure_Pa / 1000)}kPa", f"{_digits(trial.payload_kg * 1000)}g"]
+        pressure = f"{_digits(UNITS[trial.pressure_unit].from_si(trial.pressure_Pa))}{trial.pressure_unit}"
+        parts = [vine, pressure, f"{_digits(trial.payload_kg * 1000)}g"]
         parts += [_yield_pressure(trial)] if yields[vine] > 1 else []
         parts += filter(None, (_part(column, trial) for column in shown))
         named.append(replace(trial, vine=vine, condition="_".join(parts)))

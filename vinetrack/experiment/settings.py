@@ -399,7 +399,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
         for other, (name, unit) in renamed.items():
             row[name] = _converted(row.pop(other), unit, name, table.decimal)
     columns = tuple(dict.fromkeys(renamed.get(name, (name, ""))[0] for name in table.columns))
-    return replace(table, columns=columns, rows=tuple(rows)), problems
+    return replace(table, columns=columns, rows=tuple(rows), units=dict(renamed.values())), problems
 
 
 def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> None:

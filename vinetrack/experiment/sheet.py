@@ -34,6 +34,7 @@ class Row:
 
     name: str
     line: int
+    pressure_unit: str = "kPa"
     values: dict[str, Any] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
@@ -140,11 +141,11 @@ class Row:
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     """Read and check the cells of one row; shared settings fill blank cells. An invalid name gives way to the line."""
     cells, line = table.rows[index], table.lines[index]
-    name = cells.get("trial", f"line-{line}")
+    name, unit = cells.get("trial", f"line-{line}"), table.units.get("pressure_kPa", "kPa")
     if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}", name, re.ASCII):
-        row = Row(name, line)
+        row = Row(name, line, unit)
     else:
-        row = Row(f"line-{line}", line)
+        row = Row(f"line-{line}", line, unit)
         code, message = ("name", "is not a valid trial name") if name else ("blank", "is blank")
         remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
         row.add(code, message, "trial", value=name, allowed=COLUMNS["trial"].allowed, remedy=remedy)
@@ -221,6 +222,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
     return Trial(
         **fields,
+        pressure_unit=row.pressure_unit,
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,

@@ -217,4 +217,4 @@ def features(trial: Trial) -> list[str]:
     sizes += f" × {1e6 * trial.thickness_m:.4g} µm" if np.isfinite(trial.thickness_m) else ""
     sizes += f" × {1e3 * trial.length_m:.4g} mm" if np.isfinite(trial.length_m) else ""
     payload = [f"{1e3 * trial.payload_kg:.3g} g"] if trial.payload_kg else []
-    return [sizes, f"{1e-3 * trial.pressure_Pa:.3g} kPa", *payload]
+    return [sizes, trial.pressure_in_words(), *payload]

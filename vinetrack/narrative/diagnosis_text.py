@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
 from vinetrack.core.terminal import html_table
-from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, number, with_error, with_interval
+from vinetrack.core.units import (
+    PREDICTION_UNITS,
+    decimals,
+    display_unit,
+    number,
+    pressure_text,
+    with_error,
+    with_interval,
+)
 from vinetrack.diagnosis.result import (
     EXPECTED,
     NOT_TESTABLE,
@@ -470,10 +478,10 @@ def _force_text(value_N: float, sigma_N: float) -> str:
 # Where a model fails, what drifts, and the force that it lacks.
 
 
-def _condition_text(pressure_Pa: float, payload_kg: float | None = None, vine: str = "") -> str:
+def _condition_text(pressure_Pa: float, unit: str, payload_kg: float | None = None, vine: str = "") -> str:
     """Return what names a condition: pressure, and payload and vine where they vary."""
     load = "" if payload_kg is None else f" with {1e3 * payload_kg:.3g} g"
-    return f"{pressure_Pa / 1e3:.3g} kPa{load}{f' ({vine})' if vine else ''}"
+    return f"{pressure_text(pressure_Pa, unit)}{load}{f' ({vine})' if vine else ''}"
 
 
 def fails_most_text(
@@ -651,11 +659,11 @@ def trial_text(trial: Trial) -> str:
     direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
     rig = "" if math.isnan(trial.chamber_m3) else f", chamber {volume_text(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
-    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
+    return f"{size} at {trial.pressure_in_words(4)}, {payload}, growing {direction}{rig}"
 
 
 def _size_text(trial: Trial) -> str:
-    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
+    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_in_words(4)}"
 
 
 def value_in_unit(value: float, unit: str) -> str:

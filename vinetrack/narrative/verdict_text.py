@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
-from vinetrack.core.units import decimals, display_unit, number, with_error
+from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -544,8 +544,8 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
     pressures = [
-        f" {trial.name} moves as at {trial.implied_pressure_Pa / 1e3:.3g} kPa, but {trial.stated_Pa / 1e3:.3g} kPa is"
-        " stated."
+        f" {trial.name} moves as at {pressure_text(trial.implied_pressure_Pa, trial.unit)}, but"
+        f" {pressure_text(trial.stated_Pa, trial.unit)} is stated."
         for trial in odd
         if trial.implied_pressure_Pa > 0
     ]
