@@ -60,8 +60,8 @@ def seen_crookedly() -> Pairs:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
-    def none(*about, film: bool) -> robust_covariance.Systematics:  # noqa: ARG001
-        return robust_covariance.Systematics.none([trial.time_s.size for trial in about[-1]])
+    def none(predictor, solution, sources) -> robust_covariance.Systematics:  # noqa: ARG001
+        return robust_covariance.systematics_of(predictor, solution, ())
 
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model

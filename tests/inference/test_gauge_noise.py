@@ -15,7 +15,7 @@ from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
 from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
+from vinetrack.inference.robust_covariance import systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -310,7 +310,7 @@ def test_residuals_are_position_noise_and_errors_of_their_stated_size_enter_the_
 
 def test_an_error_of_a_trace_is_estimated(fit):
     """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
-    shapes = recorded_pressures(fit.predictor, fit.solution)
+    shapes = systematics_of(fit.predictor, fit.solution, ["gauge"])
     moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.columns]
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)
@@ -342,7 +342,7 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit):
     state = fit.solution.state
     recorded = Predictor(fit.predictor.layout, list(map(solving.as_recorded, fit.predictor.data)), fit.predictor.host)
     there = recorded.residuals(state.theta, state.trial_effects)
-    errors = systematics_of(fit.predictor, fit.solution, fit.trials)
+    errors = systematics_of(fit.predictor, fit.solution)
     seen = errors.at_zero_errors(fit.solution.columns)
     off = np.concatenate([columns[:, -1] - left for columns, left in zip(seen, there, strict=True)])
     moved = np.concatenate([columns[:, -1] - left for columns, left in zip(fit.solution.columns, there, strict=True)])
@@ -401,8 +401,7 @@ def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_th
     data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
     deaf = [replace(trial_data, trace_errors_Pa=None) for trial_data in data]
     errors, without = (
-        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution, traced.trials)
-        for told in (data, deaf)
+        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution) for told in (data, deaf)
     )
     assert errors.count == without.count + 1
     moved = [columns[:, :1] for columns in errors.columns]

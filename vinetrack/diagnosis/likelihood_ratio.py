@@ -28,9 +28,8 @@ from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.position_errors import with_shapes, with_smooth_errors
 from vinetrack.inference.robust_covariance import (
     FEWEST_CLUSTERS,
+    SOURCES,
     Systematics,
-    film_errors,
-    recorded_pressures,
     robust_covariance,
     systematics_of,
 )
@@ -101,17 +100,17 @@ def with_shared_errors(fit: Fit, base: Solution) -> Solution:
     They are common to all replicates of a condition. With enough replicates they exceed the scatter of trials, and
     would pass for a difference between groups of conditions.
     """
-    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
+    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, SOURCES[:-1]))
 
 
 def with_trace_errors(fit: Fit, base: Solution) -> Solution:
     """Add the errors of recorded pressures to a solution as parameters, with the corrections of its fit undone."""
-    return with_errors(fit, base, recorded_pressures(fit.predictor, fit.solution))
+    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, ["gauge"]))
 
 
 def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1."""
-    if not errors.n_columns:
+    if not errors.count:
         return base
     columns, problem = errors.added_to(base.columns, base.problem)
     return replace(
@@ -178,8 +177,8 @@ def film_gain(fit: Fit) -> float:
     """
     if FILM in fit.model or is_poor_fit(fit.predictor, fit.solution):
         return 0.0
-    errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    if not errors.n_columns:
+    errors = systematics_of(fit.predictor, fit.solution, ["film"])
+    if not errors.count:
         return 0.0
     base = with_smooth_errors(fit)
     return max(_deviance(base, base) - _deviance(with_errors(fit, base, errors), base), 0.0)

@@ -109,7 +109,7 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
         sensitivities = effect_sensitivities(refit, [shape])
         if not sensitivities.shapes:
             return 1.0
-        systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
+        systematics = systematics_of(refit.predictor, refit.solution)
         scores = scores_of(refit, products_of(refit, sensitivities, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0

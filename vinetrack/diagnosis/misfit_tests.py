@@ -34,7 +34,13 @@ from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit, relative_residual, variance_floor
-from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, Systematics, cluster_variance, systematics_of
+from vinetrack.inference.robust_covariance import (
+    FEWEST_CLUSTERS,
+    SOURCES,
+    Systematics,
+    cluster_variance,
+    systematics_of,
+)
 
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
@@ -448,7 +454,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     trials = [trial.trial for trial in fit.trials]
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
-    systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
+    systematics = systematics_of(fit.predictor, fit.solution, [*SOURCES, "film"] if film else SOURCES)
     products = products_of(fit, sensitivities, systematics)
     structure = structure_of(fit, systematics)
     return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), structure, level)

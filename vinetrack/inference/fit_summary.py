@@ -21,7 +21,7 @@ from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, OrNaN, numbers_text
 from vinetrack.inference.position_errors import with_smooth_errors
-from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandwich
+from vinetrack.inference.robust_covariance import FILM_ERROR, moved_by, robust_covariance, systematics_of
 
 # ------------------------------------------------------------------------------
 # Sensitivity of fitted numbers to the mass of the film.
@@ -56,8 +56,9 @@ def film_influence(fit: Fit) -> Floats:
     """
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
-    errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    moved = sandwich(fit.predictor, with_smooth_errors(fit), errors)[2][: len(fit.numbers)]
+    errors, solution = systematics_of(fit.predictor, fit.solution, ["film"]), with_smooth_errors(fit)
+    plain = robust_covariance(fit.predictor, solution)[0]
+    moved = moved_by(fit.predictor, solution, errors, plain)[: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)

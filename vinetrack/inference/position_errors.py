@@ -292,7 +292,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     """Fit the smooth errors of position along with the parameters of a fit, to first order; None where
     there are none.
     """
-    shapes = _shapes(predictor, solution)
+    shapes = position_shapes(predictor, grown_in(predictor, solution))
     count = shapes[0].shape[1]
     if not count:
         return None
@@ -440,7 +440,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     """Estimate the shared parameters with trials weighted by noise and disagreement."""
     if len(predictor.data) < 2:
         return None
-    shapes = _shapes(predictor, solution)
+    shapes = position_shapes(predictor, grown_in(predictor, solution))
     count = shapes[0].shape[1]
     problem = with_shapes(solution.problem, count) if count else solution.problem
     state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
@@ -477,14 +477,14 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     return None
 
 
-def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
-    grown = [
+def grown_in(predictor: Predictor, solution: Solution) -> list[Floats]:
+    """Growth of each trial by a fit, m, shape (n_points,)."""
+    return [
         trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
         for trial_data, trial_effects, columns in zip(
             predictor.data, solution.state.trial_effects, solution.columns, strict=True
         )
     ]
-    return position_shapes(predictor, grown)
 
 
 def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:

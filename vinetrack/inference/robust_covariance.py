@@ -8,7 +8,7 @@ ever widen an error.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,10 +17,17 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
-from vinetrack.inference.fit_result import TrialFit
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.marginal_likelihood import MixedProblem, by_parameter, inverse_of_block, matrix_root
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information, with_shapes
+from vinetrack.inference.position_errors import (
+    Pooled,
+    Precision,
+    grown_in,
+    position_shapes,
+    trial_information,
+    with_shapes,
+)
 from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
 
 # ------------------------------------------------------------------------------
@@ -36,7 +43,8 @@ PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to 
 FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
 
 
-LENS = "lens"  # Source of the smooth errors of position
+# Sources of systematic errors in every fit: all but the film, which can be weighed
+SOURCES = ("payloads", "set pressures", "gauge", "tracking", "lens")
 
 # Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
 HALF_WAVES = 6
@@ -46,35 +54,29 @@ HALF_WAVES = 6
 class Systematics:
     """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
     payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
-    columns only for those that affect it. `sources`, shape (count,), names where each comes from.
+    columns only for those that affect it. `places`, shape (n_trials, n_columns), gives the error of each column, -1 for
+    none, and `sources`, shape (count,), where each error comes from. `estimated_m` is the displacement by the errors
+    that the fit has estimated and taken out.
     """
 
     columns: list[Floats]
     places: NDArray[np.int_]
-    count: int
-    estimated_m: list[Floats] | None = None
-    sources: Sequence[str] = ()
+    sources: Sequence[str]
+    estimated_m: list[Floats]
 
-    @classmethod
-    def none(cls, points: Sequence[int]) -> Systematics:
-        """No systematic errors."""
-        return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
+    @property
+    def count(self) -> int:
+        """Number of errors."""
+        return len(self.sources)
 
     def at_zero_errors(self, columns: Sequence[Floats]) -> list[Floats]:
         """Columns of a fit with the residual, the last column, taken at zero errors instead of the estimated ones.
         Shapes: columns (n_points, k).
         """
-        if self.estimated_m is None:
-            return list(columns)
         restored = [of_fit.copy() for of_fit in columns]
         for of_fit, trial_estimate_m in zip(restored, self.estimated_m, strict=True):
             of_fit[:, -1] += trial_estimate_m
         return restored
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns of each trial."""
-        return self.places.shape[1]
 
     def added_to(self, columns: Sequence[Floats], problem: MixedProblem) -> tuple[list[Floats], MixedProblem]:
         """Columns and problem of a fit with the errors as further parameters, each with a standard normal prior; the
@@ -84,165 +86,141 @@ class Systematics:
             np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
             for of_fit, systematic in zip(self.at_zero_errors(columns), self.columns, strict=True)
         ]
-        places = np.where(self.places < self.count, problem.prior_mean.size + self.places, -1)
+        places = np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)
         widened = with_shapes(problem, self.count)
         return extended, replace(widened, index=np.column_stack([problem.index, places]))
 
 
-def systematics_of(
-    predictor: Predictor,
-    solution: Solution,
-    trials: Sequence[TrialFit],
-    *,
-    positions: bool = True,
-    film: bool = False,
-) -> Systematics:
-    """All systematic errors of a fit."""
-    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    recorded = recorded_pressures(predictor, solution)
-    named = {
-        "payloads": _payload_errors(predictor, solution),
-        "set pressures": _set_pressure_errors(predictor, solution),
-        "gauge": recorded,
-        **({"film": film_errors(predictor, solution, trials)} if film else {}),
-        "tracking": _of_every_trial(_tracker_errors(predictor, grown)),
-        **({LENS: _of_every_trial(position_shapes(predictor, grown))} if positions else {}),
+# By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
+Displaced = Mapping[int, tuple[Hashable, Floats]]
+
+
+def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[str] = SOURCES) -> Systematics:
+    """The systematic errors of a fit that come from these sources: those of every fit, and `film`."""
+    functions: dict[str, Callable[[Predictor, Solution], Displaced]] = {
+        "payloads": _payload_errors,
+        "set pressures": _set_pressure_errors,
+        "gauge": _gauge_errors,
+        "film": _film_errors,
+        "tracking": _tracker_errors,
+        "lens": _lens_errors,
     }
-    parts = list(named.values())
-    *begins, total = np.cumsum([0, *(part.count for part in parts)]).tolist()
-    places = [
-        np.where(part.places < part.count, begin + part.places, total)
-        for part, begin in zip(parts, begins, strict=True)
-    ]
-    columns = [np.hstack(of_trial) for of_trial in zip(*(part.columns for part in parts), strict=True)]
-    sources = [name for name, part in named.items() for _ in range(part.count)]
-    return Systematics(columns, np.hstack(places), total, recorded.estimated_m, sources)
+    data = predictor.data
+    columns: list[list[Floats]] = [[np.zeros((each.time_s.size, 0))] for each in data]
+    places: list[list[int]] = [[] for _ in data]
+    estimated_m = [np.zeros(each.time_s.size) for each in data]
+    errors: dict[tuple[str, Hashable, int], int] = {}
+    for source in sources:
+        displaced = functions[source](predictor, solution)
+        width = max((moved_m.shape[1] for _, moved_m in displaced.values()), default=0)
+        for i, (trial_data, (nothing, *_)) in enumerate(zip(data, columns, strict=True)):
+            group, moved_m = displaced.get(i, (None, nothing))
+            own = [errors.setdefault((source, group, k), len(errors)) for k in range(moved_m.shape[1])]
+            places[i] += own + [-1] * (width - len(own))
+            columns[i].append(np.pad(moved_m, ((0, 0), (0, width - len(own)))))
+            if source == "gauge" and own and trial_data.trace_error_sizes is not None:
+                estimated_m[i] = moved_m @ trial_data.trace_error_sizes
+    index = np.array(places, dtype=int).reshape(len(data), -1)
+    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors], estimated_m)
 
 
-def _of_every_trial(columns: list[Floats]) -> Systematics:
-    """Errors that affect every trial."""
-    count = columns[0].shape[1]
-    return Systematics(columns, np.tile(np.arange(count), (len(columns), 1)), count)
+def _changes_of(
+    predictor: Predictor, solution: Solution, varied: Sequence[tuple[int, FitTrial]]
+) -> Iterator[tuple[int, Floats]]:
+    """Indices of trials, each as it is or as it might be, and the change of their positions, m, shape (n_points, 1);
+    nothing where one cannot be simulated.
+    """
+    if not varied:
+        return
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    trials = [i for i, _ in varied]
+    once = list(dict.fromkeys(trials))
+    other = Predictor(predictor.layout, [trial_data for _, trial_data in varied], predictor.host)
+    try:
+        plain = dict(zip(once, predictor.run(jobs[once]), strict=True))
+        moved = other.run(replace(jobs[trials], trial=np.arange(len(varied))))
+    except SimulationError:
+        return
+    for i, trajectory in zip(trials, moved, strict=True):
+        yield i, position_change(plain[i], trajectory)[:, None]
 
 
-def _one_per_group(predictor: Predictor, moved_m: Mapping[int, Floats], names: Mapping[int, Hashable]) -> Systematics:
-    """One error for each group of trials: displacements and names of the groups, by index of the trial."""
-    places = {name: k for k, name in enumerate(dict.fromkeys(names.values()))}
-    sizes = [trial_data.time_s.size for trial_data in predictor.data]
-    if not places:
-        return Systematics.none(sizes)
-    columns = [moved_m[i][:, None] if i in moved_m else np.zeros((size, 1)) for i, size in enumerate(sizes)]
-    of_trial = [places[names[i]] if i in names else len(places) for i in range(len(sizes))]
-    return Systematics(columns, np.array(of_trial)[:, None], len(places))
-
-
-def _payload_errors(predictor: Predictor, solution: Solution) -> Systematics:
+def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
     payload_step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
-    trials = [trial_data.trial for trial_data in predictor.data]
-    heavier = {
-        i: replace(trial, payload_kg=(1 + payload_step) * trial.payload_kg)
-        for i, trial in enumerate(trials)
-        if trial.payload_kg > 0 and trial.travel_ratio != 1
-    }
-    # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
-    moved_m = {i: 0.005 / payload_step * change_m for i, change_m in _changes_of(predictor, solution, heavier).items()}
-    return _one_per_group(predictor, moved_m, {i: round(trials[i].payload_kg, 9) for i in moved_m})
-
-
-def film_errors(predictor: Predictor, solution: Solution, fits: Sequence[TrialFit]) -> Systematics:
-    """Error of the film mass of each vine, `FILM_ERROR`."""
-    heavier = {
-        i: replace(fit.trial, film_density_kg_m3=(1 + FILM_ERROR) * fit.trial.film_density_kg_m3)
-        for i, fit in enumerate(fits)
-        if fit.trial.linear_density_kg_m > 0
-    }
-    moved_m = _changes_of(predictor, solution, heavier)
-    return _one_per_group(predictor, moved_m, {i: fits[i].trial.vine for i in moved_m})
-
-
-def _changes_of(predictor: Predictor, solution: Solution, changed: Mapping[int, Trial]) -> dict[int, Floats]:
-    """Changes of the positions of some trials, m, by index, if they were as given; none where one cannot be
-    simulated.
-    """
-    if not changed:
-        return {}
-    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)[list(changed)]
-    data = [replace(each, trial=changed.get(i, each.trial)) for i, each in enumerate(predictor.data)]
-    try:
-        plain, moved = predictor.run(jobs), Predictor(predictor.layout, data, predictor.host).run(jobs)
-    except SimulationError:
-        return {}
-    return {i: position_change(one, other) for i, one, other in zip(changed, plain, moved, strict=True)}
-
-
-def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematics:
-    """Error of the set pressure of each condition, shared by its replicates."""
-    trials = {
-        i: trial_data.trial
-        for i, trial_data in enumerate(predictor.data)
-        if predictor.has_pressure_deviation[i] and trial_data.trace is None
-    }
-    moved_m = {
-        i: PRESSURE_ERROR_PA / trial.pressure_Pa * solution.columns[i][:, PRESSURE] for i, trial in trials.items()
-    }
-    return _one_per_group(predictor, moved_m, {i: trial.condition for i, trial in trials.items()})
-
-
-def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
-    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
-    data = predictor.data
-    errors_Pa = [np.zeros((0, 0)) if each.trace_errors_Pa is None else each.trace_errors_Pa for each in data]
-    counts = [errors.shape[1] for errors in errors_Pa]
-    n_columns = max(counts)
-    no_errors = Systematics.none([trial_data.time_s.size for trial_data in data])
-    if not n_columns:
-        return no_errors
-    columns = [np.zeros((trial_data.time_s.size, n_columns)) for trial_data in data]
-    places = np.full((len(data), n_columns), sum(counts))
-    begins = np.cumsum([0, *counts])
-    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
-    try:
-        plain = predictor.run(jobs)
-        for k in range(n_columns):
-            rows = [i for i, count in enumerate(counts) if count > k]
-            varied = list(data)
-            for i in rows:
-                clock_s, pressure_Pa = data[i].trace or (np.zeros(0), np.zeros(0))
-                varied[i] = replace(data[i], trace=(clock_s, pressure_Pa + errors_Pa[i][:, k]))
-            other = Predictor(predictor.layout, varied, predictor.host)
-            for i, perturbed in zip(rows, other.run(jobs[rows]), strict=True):
-                columns[i][:, k] = position_change(plain[i], perturbed)
-                places[i, k] = begins[i] + k
-    except SimulationError:
-        return no_errors
-    estimated_m = [
-        np.zeros(trial_data.time_s.size)
-        if trial_data.trace_error_sizes is None
-        else column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
-        for column, trial_data in zip(columns, data, strict=True)
+    heavier = [
+        (i, replace(each, trial=replace(each.trial, payload_kg=(1 + payload_step) * each.trial.payload_kg)))
+        for i, each in enumerate(predictor.data)
+        if each.trial.payload_kg > 0 and each.trial.travel_ratio != 1
     ]
-    return Systematics(columns, places, sum(counts), estimated_m)
+    # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
+    return {
+        i: (round(predictor.data[i].trial.payload_kg, 9), 0.005 / payload_step * change_m)
+        for i, change_m in _changes_of(predictor, solution, heavier)
+    }
 
 
-def _tracker_errors(predictor: Predictor, grown: Sequence[Floats]) -> list[Floats]:
+def _film_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Error of the film mass of each vine, `FILM_ERROR`."""
+    heavier = [
+        (
+            i,
+            replace(
+                each, trial=replace(each.trial, film_density_kg_m3=(1 + FILM_ERROR) * each.trial.film_density_kg_m3)
+            ),
+        )
+        for i, each in enumerate(predictor.data)
+        if each.trial.linear_density_kg_m > 0
+    ]
+    return {i: (predictor.data[i].trial.vine, change_m) for i, change_m in _changes_of(predictor, solution, heavier)}
+
+
+def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Error of the set pressure of each condition, shared by its replicates."""
+    return {
+        i: (each.trial.condition, PRESSURE_ERROR_PA / each.trial.pressure_Pa * solution.columns[i][:, [PRESSURE]])
+        for i, each in enumerate(predictor.data)
+        if predictor.has_pressure_deviation[i] and each.trace is None
+    }
+
+
+def _gauge_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
+    misread = [
+        (i, replace(each, trace=(each.trace[0], each.trace[1] + error_Pa)))
+        for i, each in enumerate(predictor.data)
+        if each.trace is not None and each.trace_errors_Pa is not None
+        for error_Pa in each.trace_errors_Pa.T
+    ]
+    of_trial: dict[int, list[Floats]] = {}
+    for i, change_m in _changes_of(predictor, solution, misread):
+        of_trial.setdefault(i, []).append(change_m)
+    return {i: (i, np.hstack(changes_m)) for i, changes_m in of_trial.items()}
+
+
+def _lens_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Smooth errors of position that all trials of a camera share."""
+    return {i: ("", shapes) for i, shapes in enumerate(position_shapes(predictor, grown_in(predictor, solution)))}
+
+
+def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
-    stated = [trial_data.slow_m for trial_data in predictor.data]
-    if all(slow_m is None for slow_m in stated):
-        return [np.zeros((growth_m.size, 0)) for growth_m in grown]
+    grown = grown_in(predictor, solution)
     # With extreme parameters no trial moves, and all growth fractions are zero.
     largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
-    return [_slow_shapes(growth_m / largest_growth_m, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
+    return {
+        i: ("", _slow_shapes(growth_m / largest_growth_m, each.slow_m))
+        for i, (growth_m, each) in enumerate(zip(grown, predictor.data, strict=True))
+        if each.slow_m is not None
+    }
 
 
-def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
+def _slow_shapes(part: Floats, slow_m: Floats) -> Floats:
     """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m. Waves along the growth
     have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
     the very start and one after it; two more grow towards the end.
     """
     end_shapes = ((0.1, 2.0), (0.03, 4.0))  # Fractions of the growth before its end (measured)
-    if slow_m is None:
-        return np.zeros((part.size, HALF_WAVES + 2 + len(end_shapes)))
     usual = np.minimum(slow_m, np.median(slow_m))
     excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
@@ -278,7 +256,6 @@ def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
 def widened_covariance(
     predictor: Predictor,
     solution: Solution,
-    trials: Sequence[TrialFit],
     model_precision: Precision,
     extended: Solution | None = None,
     pooled: Pooled | None = None,
@@ -286,11 +263,13 @@ def widened_covariance(
     """Covariance and degrees of freedom at the end of a fit, widened by the scatter of trials and by
     systematic errors.
     """
-    systematics = systematics_of(predictor, solution, trials, positions=extended is None)
-    plain, robust, moved = sandwich(predictor, extended or solution, systematics)
-    at_most = model_precision.degrees
-    spare = len(trials) - int(np.count_nonzero(np.diag(plain) > 0))
-    if pooled is None and len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
+    # The lens is among the parameters of the extended solution.
+    systematics = systematics_of(predictor, solution, SOURCES[: None if extended is None else -1])
+    plain, robust = robust_covariance(predictor, extended or solution)
+    moved = moved_by(predictor, extended or solution, systematics, plain)
+    at_most, trials = model_precision.degrees, len(predictor.data)
+    spare = trials - int(np.count_nonzero(np.diag(plain) > 0))
+    if pooled is None and trials >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
         variance = np.diag(robust)
         clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
         few = np.full(variance.size, float(min(spare, clusters - 1)))
@@ -309,22 +288,15 @@ def widened_covariance(
     )
     unknown = np.flatnonzero(~np.isfinite(np.diag(model_precision.covariance)))
     covariance[unknown, unknown] = np.inf
-    sources = np.array(systematics.sources)
-    shared = {name: np.sum(moved[:, sources == name] ** 2, axis=1) for name in dict.fromkeys(systematics.sources)}
+    source_of = np.array(systematics.sources)
+    shared = {name: np.sum(moved[:, source_of == name] ** 2, axis=1) for name in dict.fromkeys(systematics.sources)}
     if extended is not None:
         # What the parameters would be known better by if the errors of the lens, the last unknowns, were known.
         first = solution.problem.prior_mean.size
         across = plain[:first, first:] @ np.linalg.pinv(plain[first:, first:], hermitian=True)
         lens = np.sum(across * plain[:first, first:], axis=1) * ratio[:first] ** 2
-        shared[LENS] = np.append(lens, np.zeros(len(plain) - first))
+        shared["lens"] = np.append(lens, np.zeros(len(plain) - first))
     return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
-
-
-def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
-    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials. Returns
-    plain, robust : arrays, shape (n_free, n_free).
-    """
-    return sandwich(predictor, solution, _one_per_group(predictor, {}, {}))[:2]
 
 
 def _few_trial_variances(
@@ -367,14 +339,13 @@ def _few_trial_variances(
     return variance, degrees
 
 
-def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and the change of each free parameter by
-    one standard deviation of each systematic error, to first order, shape (n_free, count). Parameters at a bound are
-    fixed there.
+def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
+    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials, shape
+    (n_free, n_free) each. Parameters at a bound are fixed there.
     """
     problem, theta = solution.problem, solution.state.theta
     information, scores = trial_information(solution)
-    size, trials = len(theta), len(scores)
+    trials = len(scores)
     square = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (theta > problem.lower) & (theta < problem.upper)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
@@ -390,11 +361,16 @@ def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics)
     if len(set(groups)) < trials:
         by_group = plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    if not systematics.n_columns:
-        return plain, robust, np.zeros((size, 0))
-    columns, widened = systematics.added_to(solution.columns, problem)
+    return plain, robust
+
+
+def moved_by(predictor: Predictor, solution: Solution, systematics: Systematics, plain: Floats) -> Floats:
+    """Change of each free parameter by one standard deviation of each systematic error, to first order. Shapes: plain
+    (n_free, n_free) → (n_free, count).
+    """
+    columns, widened = systematics.added_to(solution.columns, solution.problem)
     both = replace(solution, problem=widened, cross_products=predictor.products(columns))
-    return plain, robust, plain @ trial_information(both)[0].sum(axis=0)[:size, size:]
+    return np.asarray(plain @ trial_information(both)[0].sum(axis=0)[: len(plain), len(plain) :])
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:

@@ -67,7 +67,7 @@ from vinetrack.inference.position_errors import (
     smooth_errors,
     student,
 )
-from vinetrack.inference.robust_covariance import recorded_pressures, too_few_clusters, widened_covariance
+from vinetrack.inference.robust_covariance import systematics_of, too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -322,10 +322,10 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
     a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
     """
-    errors = recorded_pressures(predictor, solution)
-    if not errors.n_columns:
+    errors = systematics_of(predictor, solution, ["gauge"])
+    if not errors.count:
         return np.zeros((len(predictor.data), 0))
-    sizes = np.zeros((len(predictor.data), errors.n_columns))
+    sizes = np.zeros((len(predictor.data), errors.places.shape[1]))
     for row, trial_data in zip(sizes, predictor.data, strict=True):
         if trial_data.trace_error_sizes is not None:
             row[: trial_data.trace_error_sizes.size] = trial_data.trace_error_sizes
@@ -338,7 +338,7 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     # The errors come first; they are eliminated as well, each with a standard normal prior.
     order = [*range(p + 1, blocks.shape[-1]), *range(p + 1)]
     blocks = blocks[:, order][:, :, order]
-    blocks[:, : errors.n_columns, -1] -= sizes
+    blocks[:, : sizes.shape[1], -1] -= sizes
     reduced, response = eliminated(blocks, np.ones_like(sizes))
     information = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
     gradient = sum_vector_blocks(reduced[:, :-1, -1], problem)
@@ -461,7 +461,7 @@ def assemble(
         )
     if smooth is not None:
         trials = _with_smooth_errors_removed(trials, smooth)
-    precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, extended if smooth else None, pooled)
+    precision_of_fit = widened_covariance(predictor, solution, by_noise, extended if smooth else None, pooled)
     precision_of_fit = precision_of_fit.first(len(layout.free))
     numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
     count = len(numbers)
