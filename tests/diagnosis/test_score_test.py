@@ -166,7 +166,7 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out(monkeypatch):
     places = np.tile([0, 1], (12, 1))
     monkeypatch.setattr(score_test, "products_without_trial_effects", lambda *_: blocks)
     arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
-    problem = SimpleNamespace(places=places, places_of_pairs=np.tile([0, 1, 3, 4], 12), **arrays)
+    problem = SimpleNamespace(index=places, places_of_pairs=np.tile([0, 1, 2, 4, 5, 6, 8, 9, 10], 12), **arrays)
     products = SimpleNamespace(problem=problem, n_unknowns=2, n_shapes=3)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
     found = score_test.projected(SimpleNamespace(numbers=()), products, state)

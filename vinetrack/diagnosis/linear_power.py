@@ -192,7 +192,7 @@ def residual_displacements(fit: Fit, products: Products) -> Floats:
     for part in products.parts:
         white = at_correlation(products.cross_products(part), state.rho) / state.variance[part, None, None]
         response = eliminated(white, precision[part])[1]
-        for columns, of_effects, places in zip(products.columns[part], response, problem.places[part], strict=True):
+        for columns, of_effects, places in zip(products.columns[part], response, problem.index[part], strict=True):
             own = columns[:, N_TRIAL_EFFECTS:] - columns[:, :N_TRIAL_EFFECTS] @ of_effects
             left = own[:, n_unknowns + 1 :] - own[:, :n_unknowns] @ lever[places]
             largest.append(np.max(np.abs(left), axis=0))

@@ -34,8 +34,7 @@ from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
     inverse_of_block,
-    sum_matrix_blocks,
-    sum_vector_blocks,
+    summed,
     trial_effects_eliminated,
 )
 from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
@@ -481,11 +480,12 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     problem, p = products.problem, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     blocks = products_without_trial_effects(products, state)
-    hessian = sum_matrix_blocks(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
-    gradient = sum_vector_blocks(blocks[:, X, r], problem) - problem.prior_precision * _deviation(problem, state)
+    # Systematic errors are at their prior means.
+    unknowns = np.append(state.theta, problem.prior_mean[state.theta.size :])
+    hessian, gradient, _ = summed(np.ascontiguousarray(blocks[:, : p + 1, : p + 1]), problem, unknowns)
     # Unknowns to which a trial does not respond are added up in a last row, and dropped.
     cross = np.zeros((problem.prior_mean.size + 1, products.n_shapes))
-    np.add.at(cross, problem.places, blocks[:, X, C])
+    np.add.at(cross, problem.index, blocks[:, X, C])
     total = blocks[:, C, C].sum(axis=0)
     estimated = _adapting(fit, problem, hessian)
     of_fit = estimated[estimated < state.theta.size]
@@ -496,11 +496,6 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     score[empty] = 0.0
     lever_of_fit, step_of_fit = held @ cross[:-1], held @ gradient
     return Projection(blocks, lever, step, lever_of_fit, step_of_fit, of_fit.size, score, information, empty)
-
-
-def _deviation(problem: MixedProblem, state: FitState) -> Floats:
-    """Unknowns minus their prior means; systematic errors are at theirs."""
-    return np.append(state.theta, problem.prior_mean[state.theta.size :]) - problem.prior_mean
 
 
 def levers_of(fit: Fit, products: Products) -> Floats:
@@ -519,7 +514,7 @@ def levers_of(fit: Fit, products: Products) -> Floats:
 def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
     """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`."""
     projection = projected(fit, products, state or fit.state)
-    blocks, places, p = projection.blocks, products.problem.places, products.n_unknowns
+    blocks, places, p = projection.blocks, products.problem.index, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
     # the scatter of trials: the residuals are those of the fit.

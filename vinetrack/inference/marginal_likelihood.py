@@ -205,14 +205,13 @@ class MixedProblem:
         return replace(self, **{name: getattr(self, name)[trials] for name in arrays.split()})
 
     @cached_property
-    def places(self) -> NDArray[np.int_]:
-        """`index` with -1 replaced by n_free, one past the last parameter."""
-        return np.where(self.index < 0, self.prior_mean.size, self.index)
-
-    @cached_property
     def places_of_pairs(self) -> NDArray[np.int_]:
-        """Places of all pairs of a trial's columns in a flattened matrix of n_free + 1 rows."""
-        return (self.places[:, :, None] * (self.prior_mean.size + 1) + self.places[:, None, :]).ravel()
+        """Places of all pairs of a trial's keys and residual in a flattened matrix of the n_free parameters, the
+        residual, and what belongs to none.
+        """
+        size = self.prior_mean.size + 2
+        places = np.pad(self.index, ((0, 0), (0, 1)), constant_values=size - 2) % size
+        return (places[:, :, None] * size + places[:, None, :]).ravel()
 
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
@@ -247,39 +246,24 @@ def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
     return np.asarray(np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
-def sum_matrix_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
-    """Add the matrix block of each trial to the rows and columns of its free parameters, over all trials. Shapes:
-    blocks (n_trials, n_keys, n_keys) → (n_free, n_free).
+def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats, Floats, float]:
+    """Normal equations of the free parameters: the blocks of keys and residual of all trials added up, and the priors.
+    Returns information, slope (half the negative gradient of the sum of squares), square (the penalised sum of
+    squares). Shapes: blocks (n_trials, n_keys + 1, n_keys + 1); theta (n_free,).
     """
-    p = problem.prior_mean.size
-    total = np.bincount(problem.places_of_pairs, weights=blocks.ravel(), minlength=(p + 1) ** 2)
-    return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
-
-
-def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
-    """Add the vector block of each trial to the entries of its free parameters, over all trials. Shapes: blocks
-    (n_trials, n_keys) → (n_free,).
-    """
-    p = problem.prior_mean.size
-    return np.asarray(np.bincount(problem.places.ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
+    size, prior, deviation = theta.size + 2, problem.prior_precision, theta - problem.prior_mean
+    total = np.asarray(np.bincount(problem.places_of_pairs, blocks.ravel(), size**2), dtype=float).reshape(size, size)
+    square = float(total[-2, -2] + np.sum(prior * deviation**2))
+    return total[:-2, :-2] + np.diag(prior), total[:-2, -2] - prior * deviation, square
 
 
 def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
-    """Blocks of trials at the unknowns of a campaign; those at −1 or `size` are dropped. Shapes: blocks (n, k, k);
-    index (n, k) → (n, size, size).
+    """Blocks of trials at the unknowns of a campaign; those at −1 are dropped. Shapes: blocks (n, k, k); index (n, k) →
+    (n, size, size).
     """
     placed = np.zeros((len(blocks), size + 1, size + 1))
     np.add.at(placed, (np.arange(len(blocks))[:, None, None], index[:, :, None], index[:, None, :]), blocks)
     return placed[:, :size, :size]
-
-
-def by_parameter(blocks: Floats, problem: MixedProblem) -> Floats:
-    """The vector block of each trial at the entries of its free parameters. Shapes: blocks (n_trials, n_keys) →
-    (n_trials, n_free).
-    """
-    single = np.zeros((len(blocks), problem.prior_mean.size + 1))
-    np.add.at(single, (np.arange(len(blocks))[:, None], problem.places), blocks)
-    return single[:, :-1]
 
 
 def inverse_of_block(square: Floats, places: NDArray[np.int_]) -> Floats:
@@ -364,21 +348,21 @@ def levenberg_marquardt_step(
     of squares along this step, by the linear model without the damping). Shapes: cross_products (n_trials, 3, k, k) →
     (n_free,).
     """
-    keys, precision = slice(N_TRIAL_EFFECTS, -1), trial_effect_prior(problem, state)[1]
+    precision = trial_effect_prior(problem, state)[1]
     white = _with_prior_gradient(cross_products, problem, state)
-    prior, prior_slope = problem.prior_precision, problem.prior_precision * (problem.prior_mean - state.theta)
     damped = precision + damping * (np.einsum("nkk->nk", white)[:, :N_TRIAL_EFFECTS] + precision)
     reduced, response = eliminated(white, damped)
-    diagonal = np.diag(sum_matrix_blocks(white[:, keys, keys], problem)) + prior
-    square = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(prior + damping * diagonal)
-    slope = sum_vector_blocks(reduced[:, :-1, -1], problem) + prior_slope
+    of_keys = np.ascontiguousarray(white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:])
+    undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
+    square = information + np.diag(damping * np.diag(undamped[0]))
     step, _ = bounded_solve(square, slope, problem, state.theta)
     step_of_keys = np.append(step, 0.0)[problem.index]
     trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
     # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
     steps = np.hstack([trial_effect_step, step_of_keys])
     curvature = np.einsum("nu,nuv,nv->", steps, white[:, :-1, :-1], steps, optimize=True)
-    curvature += np.sum(precision * trial_effect_step**2) + np.sum(prior * step**2)
+    prior_slope = problem.prior_precision * (problem.prior_mean - state.theta)
+    curvature += np.sum(precision * trial_effect_step**2) + np.sum(problem.prior_precision * step**2)
     predicted_decrease = float(2 * (step @ prior_slope + np.sum(steps * white[:, :-1, -1])) - curvature)
     return step, trial_effect_step, predicted_decrease
 
@@ -453,27 +437,14 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     return Marginal(eliminated(white, precision)[0], constant)
 
 
-def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, float]:
-    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out; and the sum
-    over trials of ln det(I + S Z S) of the deviations, of standard deviations S. Shape (n_trials, n_keys + 1, n_keys +
-    1); the last row and column belong to the residual.
-    """
-    return without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
-
-
 def normal_equations(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
-    """Normal equations of the free parameters at given between-trial standard deviations. Returns information, slope
-    (half the negative gradient of the sum of squares), square (penalised sum of squares at the current parameters),
-    log_det (sum over trials of ln det(I + S Z S)). Shape (n_free, n_free).
+    """Normal equations of the free parameters at given between-trial standard deviations, as `summed` returns them, and
+    the sum over trials of ln det(I + S Z S).
     """
-    blocks, log_det = deviations_eliminated(part, problem, spread)
-    prior, deviation = problem.prior_precision, state.theta - problem.prior_mean
-    information = sum_matrix_blocks(blocks[:, :-1, :-1], problem) + np.diag(prior)
-    slope = sum_vector_blocks(blocks[:, :-1, -1], problem) - prior * deviation
-    square = float(np.sum(blocks[:, -1, -1]) + np.sum(prior * deviation**2))
-    return information, slope, square, log_det
+    blocks, log_det = without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
+    return *summed(blocks, problem, state.theta), log_det
 
 
 def deviance(
@@ -481,19 +452,9 @@ def deviance(
 ) -> float:
     """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters."""
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    constant = square + log_det + part.log_constant
-    return profiled_deviance(information, slope, constant, problem, state, restricted=restricted)
-
-
-def profiled_deviance(
-    information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
-) -> float:
-    """−2 ln L minimised over the free parameters, from their normal equations. Shapes: information (n_free, n_free);
-    slope (n_free,).
-    """
     # A parameter at its bound must not be credited with the decrease beyond the bound.
     step, moving = bounded_solve(information, slope, problem, state.theta)
-    total = constant - float(step @ (2 * slope - information @ step))
+    total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
     if restricted:
         return total + float(np.linalg.slogdet(information[np.ix_(moving, moving)])[1])
     k = np.flatnonzero(moving & problem.random)

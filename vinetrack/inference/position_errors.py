@@ -30,7 +30,6 @@ from vinetrack.inference.marginal_likelihood import (
     Marginal,
     MixedProblem,
     at_unknowns,
-    by_parameter,
     deviance,
     estimate_noise,
     inverse_of_block,
@@ -557,8 +556,8 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     problem = solution.problem
     size, p = problem.prior_mean.size, problem.index.shape[1]
     blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
-    information = at_unknowns(blocks[:, :p, :p], problem.index, size)
-    return information, by_parameter(blocks[:, :p, p], problem)
+    placed = at_unknowns(blocks, np.pad(problem.index, ((0, 0), (0, 1)), constant_values=size), size + 1)
+    return placed[:, :-1, :-1], placed[:, :-1, -1]
 
 
 def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:

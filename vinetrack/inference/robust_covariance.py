@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.marginal_likelihood import MixedProblem, by_parameter, inverse_of_block, matrix_root
+from vinetrack.inference.marginal_likelihood import MixedProblem, inverse_of_block, matrix_root
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import (
     Pooled,
@@ -351,7 +351,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_of_block(square, estimated)
     # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
-    depend = by_parameter(np.ones(problem.index.shape), problem) > 0
+    depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)

@@ -33,13 +33,9 @@ from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
-    bounded_solve,
-    eliminated,
+    levenberg_marquardt_step,
     solve_per_trial,
-    sum_matrix_blocks,
-    sum_vector_blocks,
     trial_effect_prior,
-    trial_effects_eliminated,
     whitened_products,
     with_diagonal,
 )
@@ -322,30 +318,15 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
     a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
     """
-    errors = systematics_of(predictor, solution, ["gauge"])
-    if not errors.count:
-        return np.zeros((len(predictor.data), 0))
-    sizes = np.zeros((len(predictor.data), errors.places.shape[1]))
-    for row, trial_data in zip(sizes, predictor.data, strict=True):
-        if trial_data.trace_error_sizes is not None:
-            row[: trial_data.trace_error_sizes.size] = trial_data.trace_error_sizes
-    problem, state = solution.problem, solution.state
-    cross_products = predictor.products(
-        [np.column_stack(both) for both in zip(solution.columns, errors.columns, strict=True)]
-    )
-    p = solution.cross_products.shape[-1] - N_TRIAL_EFFECTS - 1
-    blocks = trial_effects_eliminated(cross_products, p, problem, state)
-    # The errors come first; they are eliminated as well, each with a standard normal prior.
-    order = [*range(p + 1, blocks.shape[-1]), *range(p + 1)]
-    blocks = blocks[:, order][:, :, order]
-    blocks[:, : sizes.shape[1], -1] -= sizes
-    reduced, response = eliminated(blocks, np.ones_like(sizes))
-    information = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
-    gradient = sum_vector_blocks(reduced[:, :-1, -1], problem)
-    gradient -= problem.prior_precision * (state.theta - problem.prior_mean)
-    step, _ = bounded_solve(information, gradient, problem, state.theta)
-    spread_out = np.append(step, 0.0)[problem.index]
-    return np.asarray(response[:, :, -1] - np.einsum("nek,nk->ne", response[:, :, :-1], spread_out))
+    errors, state = systematics_of(predictor, solution, ["gauge"]), solution.state
+    columns, problem = errors.added_to(solution.columns, solution.problem)
+    state = replace(state, theta=np.append(state.theta, np.zeros(errors.count)))
+    step, _, _ = levenberg_marquardt_step(predictor.products(columns), problem, state, 0.0)
+    estimates = np.append(step[len(step) - errors.count :], 0.0)[errors.places]
+    for row, trial_data in zip(estimates, predictor.data, strict=True):
+        if trial_data.trace_error_sizes is not None and row.size:
+            row[: trial_data.trace_error_sizes.size] -= trial_data.trace_error_sizes
+    return np.asarray(estimates)
 
 
 # ------------------------------------------------------------------------------
