@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,7 +42,7 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.position_errors import pool, position_shapes, student, trial_information
+from vinetrack.inference.position_errors import Pooled, pool, position_shapes, student, trial_information
 from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -102,18 +102,6 @@ class Calibration(NamedTuple):
     degrees: float
 
 
-@dataclass(frozen=True)
-class _Basis:
-    """The fit as predictions use it: scaled parameters, including smooth errors of position where there are any.
-    `information` and `scores` are those of the trials, `between` is the between-trial covariance of the parameters.
-    """
-
-    solution: Solution
-    information: Floats
-    scores: Floats
-    between: Floats
-
-
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
     """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
     basis = _pooled_basis(fit)
@@ -144,16 +132,16 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
     return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 
-def _pooled_basis(fit: Fit) -> _Basis:
+def _pooled_basis(fit: Fit) -> Pooled:
+    """The fit as predictions use it, with trials that disagree weighted by it."""
     disagree = fit.between is not None and fit.between.any()
     pooled = pool(fit.predictor, fit.solution, len(fit.numbers)) if disagree else None
-    if pooled is not None:
-        return _Basis(pooled.solution, pooled.information, pooled.scores, pooled.between)
-    size = fit.solution.problem.prior_mean.size
-    return _Basis(fit.solution, *trial_information(fit.solution), np.zeros((size, size)))
+    return pooled or Pooled(
+        fit.solution, *trial_information(fit.solution), fit.covariance, np.zeros_like(fit.covariance)
+    )
 
 
-def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
+def _calibrated(fit: Fit, basis: Pooled) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
     solution, data = basis.solution, fit.predictor.data
     pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
@@ -191,7 +179,7 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
+def _leave_one_out(basis: Pooled, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
     """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
     trials do not determine all parameters on which it depends.
     """
@@ -237,7 +225,7 @@ def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -
     return np.asarray(moved * [spread[0], spread[1], misset])
 
 
-def _loadings_of_new_trial(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """Displacement of a new trial by one standard deviation of each error, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
     theta, places = values_for_trial(fit, layout, trial_data)
@@ -280,7 +268,7 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
     return theta, places
 
 
-def _covariance(fit: Fit, basis: _Basis) -> Floats:
+def _covariance(fit: Fit, basis: Pooled) -> Floats:
     """Covariance of the parameters, scaled, with everything that widens their errors."""
     problem = basis.solution.problem
     total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)

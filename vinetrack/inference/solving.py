@@ -31,8 +31,6 @@ from vinetrack.inference.fit_result import (
 )
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
-    FitState,
-    MixedProblem,
     levenberg_marquardt_step,
     solve_per_trial,
     trial_effect_prior,
@@ -92,9 +90,9 @@ def solve_from_scratch(
     """
     reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
-    starts = candidates(predictor.layout, predictor.data, predictor)[:3]
+    starts = [start[1:] for start in candidates(predictor.layout, predictor.data, predictor)[:3]]
     most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
-    for _, theta, trial_effects in starts:
+    for theta, trial_effects in starts:
         try:
             free = solve_from(
                 predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch
@@ -104,22 +102,27 @@ def solve_from_scratch(
             reason = str(error)
     else:
         raise FitError(f"The model cannot be simulated from any starting values: {reason}")
-    if not is_poor_fit(predictor, free):
-        return free
-    at_track_correlation = [
-        _solve_at_track_correlation(predictor, theta, trial_effects, fixed_terms, watch)
-        for _, theta, trial_effects in (starts if thorough else starts[:1])
-    ]
-    return _best_unabsorbed(predictor, free, [solution for solution in at_track_correlation if solution is not None])
+    return _less_poor(predictor, free, starts if thorough else starts[:1], fixed_terms, watch)
 
 
-def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation: list[Solution]) -> Solution:
-    """The best solution at track correlation, preferably one that is not poor; without any, the one at free noise. A
-    poor solution at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any
-    misfit has a high likelihood.
+def _less_poor(
+    predictor: Predictor,
+    solution: Solution,
+    starts: Sequence[tuple[Floats, Floats]],
+    fixed_terms: FixedTerms,
+    watch: Watch | None,
+    **how: Any,
+) -> Solution:
+    """The solution, or, if it is poor, the best at track correlation, preferably one that is not poor. A poor solution
+    at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any misfit has a high
+    likelihood. `how` are options of `_solve_at_track_correlation`.
     """
-    good = [solution for solution in at_track_correlation if not is_poor_fit(predictor, solution)]
-    return min(good or at_track_correlation or [free], key=lambda solution: solution.deviance())
+    if not is_poor_fit(predictor, solution):
+        return solution
+    found = [_solve_at_track_correlation(predictor, *start, fixed_terms, watch, **how) for start in starts]
+    again = [each for each in found if each is not None]
+    good = [each for each in again if not is_poor_fit(predictor, each)]
+    return min(good or again or [solution], key=lambda each: each.deviance())
 
 
 def _solve_at_track_correlation(
@@ -189,12 +192,22 @@ def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, *, search: bool = False, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `solve`. Shapes: theta (n_free,).
+    are options of `solve`. From bad starting values the fit descends with the noise fixed first, since their misfit
+    would be absorbed as noise and stall the optimiser. Shapes: theta (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
-    state = start_at_fixed_noise(predictor, problem, replace(before.state, theta=theta), fixed_terms, search=search)
+    state = replace(before.state, theta=theta)
+    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
+    if fixed_terms.noise is None and cost(predictor, problem, state) >= 1.5 * float(np.sum(problem.points)):
+        # An apparently late release may be the action of the new effect: each trial starts at the one that fits best.
+        aligned, _ = align(predictor.data, predictor, theta, state.trial_effects)
+        here, there = (trial_costs(predictor, problem, each) for each in (state, replace(state, trial_effects=aligned)))
+        state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
+        noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
+        steps = TRACK_CORRELATION_ITERATIONS
+        state = solve(predictor, problem, state, noise, warm=True, most_iterations=steps, search=search).state
     return solve(predictor, problem, state, fixed_terms, warm=True, search=search, **how)
 
 
@@ -215,30 +228,7 @@ def solve_again(
         trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    again = _solve_at_track_correlation(
-        predictor, theta, trial_effects, fixed_terms, watch, then_free=thorough, goal=goal
-    )
-    return solution if again is None else _best_unabsorbed(predictor, solution, [again])
-
-
-def start_at_fixed_noise(
-    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool
-) -> FitState:
-    """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed. With free noise,
-    the misfit of bad starting values would be absorbed as noise and stall the optimiser.
-    """
-    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
-    if fixed_terms.noise is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points)):
-        return state
-    # An apparently late release may be the action of the new effect: each trial starts at the release that fits best.
-    aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
-    options = [state, replace(state, trial_effects=aligned)]
-    best = np.argmin([trial_costs(predictor, problem, option) for option in options], axis=0)
-    state = replace(state, trial_effects=np.array([options[option].trial_effects[i] for i, option in enumerate(best)]))
-    noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
-    return solve(
-        predictor, problem, state, noise, warm=True, most_iterations=TRACK_CORRELATION_ITERATIONS, search=search
-    ).state
+    return _less_poor(predictor, solution, [(theta, trial_effects)], fixed_terms, watch, then_free=thorough, goal=goal)
 
 
 # ------------------------------------------------------------------------------
