@@ -297,7 +297,7 @@ def test_what_nothing_moves_or_has_no_mass_and_unknown_parameters_are_refused():
 def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campaign):
     whole, pairs, _ = campaign
     rest = [pair for pair in pairs if pair[0].condition != pairs[0][0].condition]
-    warm = fit_subset(whole, [trial.name for trial, _ in rest])
+    warm = fit_subset(whole, [trial.condition != pairs[0][0].condition for trial, _ in pairs])
     cold = vt.fit(vt.base_model(), rest, profile=False)
     assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
     for one, other in zip(warm.numbers, cold.numbers, strict=True):
@@ -310,18 +310,17 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
     assert {number.vine for number in alone.numbers} == {"", stays}
     with pytest.raises(vt.FitError):
         vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
-    for keep in (["elsewhere"], [False] * len(whole.trials), [True, False]):
-        with pytest.raises(vt.FitError):
-            fit_subset(whole, keep)
+    with pytest.raises(vt.FitError):
+        fit_subset(whole, [False] * len(whole.trials))
 
 
 def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign):
     whole, pairs, _ = campaign
-    names = [trial.name for trial in whole.trials[:9]]
-    held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
+    first = [i < 9 for i in range(len(whole.trials))]
+    held = fit_subset(whole, first, hold_spreads=True, hold_noise=True)
     assert [held.spreads[k].value for k in ("pressure", "B")] == [whole.spreads[k].value for k in ("pressure", "B")]
     assert held.noise_correlation == whole.noise_correlation
-    part = fit_subset(vt.fit(vt.base_model(), pairs, profile=False, noise=(2e-4, 0.3)), names)
+    part = fit_subset(vt.fit(vt.base_model(), pairs, profile=False, noise=(2e-4, 0.3)), first)
     assert part.noise_m == pytest.approx(2e-4)
     assert part.noise_correlation == 0.3
 
@@ -329,7 +328,7 @@ def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(cam
 def test_yield_pressures_without_error_are_no_parameters(campaign):
     exact = [(replace(trial, yield_pressure_sigma_Pa=0.0), track) for trial, track in campaign[1][:12]]
     found = vt.fit(vt.base_model(), exact, profile=False)
-    part = fit_subset(found, [trial.name for trial, _ in exact[:9]])
+    part = fit_subset(found, [i < 9 for i in range(len(exact))])
     assert {number.key for number in found.numbers} == {"eversion_damping.B", "eversion_damping.n"}
     assert {number.key for number in part.numbers} <= {number.key for number in found.numbers}
     assert np.isfinite(part.log_likelihood)

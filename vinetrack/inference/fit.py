@@ -63,7 +63,7 @@ from vinetrack.inference.solving import (
     trial_fit,
     with_fitted_trace_errors,
 )
-from vinetrack.inference.trial_effects import Indices, subset
+from vinetrack.inference.trial_effects import subset
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -332,14 +332,16 @@ def _correlation(trial_data: FitTrial, rho: float) -> Floats:
 
 def fit_subset(
     fit: Fit,
-    keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_],
+    keep: Sequence[bool],
     *,
     hold_spreads: bool = False,
     hold_noise: bool = False,
     most_iterations: int = MOST_ITERATIONS,
 ) -> Fit:
-    """Fit the same model to some of the trials of a fit, starting from its solution."""
-    rows = _rows(fit, keep)
+    """Fit the same model to the trials of a fit that are kept, starting from its solution."""
+    rows = np.flatnonzero(keep)
+    if not rows.size:
+        raise FitError("No trial is left to fit: keep one at least.")
     predictor, problem, (state,) = subset(fit.predictor, fit.solution.problem, rows, fit.state)
     fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
     if fixed_terms.noise is not None:
@@ -354,24 +356,6 @@ def fit_subset(
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
     return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
-
-
-def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
-    """Indices of the trials to keep, in the order of the fit."""
-    wanted = list(keep)
-    names = [trial.name for trial in fit.trials]
-    if wanted and all(isinstance(entry, (bool, np.bool_)) for entry in wanted):
-        if len(wanted) != len(names):
-            raise FitError(f"The mask has {len(wanted)} entries for {len(names)} trials.")
-        rows = np.flatnonzero(wanted)
-    else:
-        unknown = sorted(set(map(str, wanted)) - set(names))
-        if unknown:
-            raise FitError(f"The fit has no trial {', '.join(unknown)}.")
-        rows = np.array([i for i, name in enumerate(names) if name in set(wanted)], dtype=int)
-    if not rows.size:
-        raise FitError("No trial is left to fit: keep one at least.")
-    return rows
 
 
 # ------------------------------------------------------------------------------
