@@ -232,7 +232,10 @@ def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial:
     predictor = Predictor(layout, [trial_data], fit.predictor.host)
     trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
     columns = predictor.linearise(theta, trial_effects)[0]
-    covariance = _covariance(fit, basis) + basis.between[: len(fit.numbers), : len(fit.numbers)]
+    held = zip(fit.predictor.layout.free, fit.numbers, strict=True)
+    slopes = np.array([free.derivative(number.value) for free, number in held])
+    known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) / slopes[:, None] / slopes
+    covariance = known + basis.between[: len(fit.numbers), : len(fit.numbers)]
     parameter_covariance = np.diag(
         np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0)
     )
@@ -266,21 +269,6 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
             if number.key == free.key and number.vine in groups:
                 theta[k], places[k] = free.to_scaled(number.value), place
     return theta, places
-
-
-def _covariance(fit: Fit, basis: Pooled) -> Floats:
-    """Covariance of the parameters, scaled, with everything that widens their errors."""
-    problem = basis.solution.problem
-    total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
-    count = len(fit.numbers)
-    plain = inverse_of_block(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
-    held = fit.predictor.layout.free
-    sigma = np.array(
-        [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
-    )
-    by_noise = np.sqrt(np.maximum(np.diag(plain), 1e-300))
-    ratio = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / by_noise, 1.0), 1.0)
-    return np.asarray(plain * ratio[:, None] * ratio)
 
 
 def _with_release_and_origin_fitted(
