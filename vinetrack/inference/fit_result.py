@@ -377,10 +377,23 @@ class BetweenTrialSpread:
 
 
 @dataclass(frozen=True)
-class TrialFit:
+class TrialEstimates:
+    """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
+
+    release_s: OrNaN = math.nan
+    release_sigma_s: OrNaN = math.nan
+    origin_m: OrNaN = math.nan
+    origin_sigma_m: OrNaN = math.nan
+    pressure_deviation: OrNaN = math.nan
+    pressure_deviation_sigma: OrNaN = math.nan
+    damping_deviation: OrNaN = math.nan
+    damping_deviation_sigma: OrNaN = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialFit(TrialEstimates):
     """One trial under the model; arrays have shape (n_points,), at the points that were used. `whitened` are whitened
-    residuals, without smooth errors of position, in standard deviations. Deviations are relative to the set pressure
-    and to the vine's B.
+    residuals, without smooth errors of position, in standard deviations.
     """
 
     trial: Trial
@@ -390,14 +403,6 @@ class TrialFit:
     predicted_velocity_m_s: Floats
     residual_m: Floats
     whitened: Floats
-    release_s: float
-    release_sigma_s: float
-    origin_m: float
-    origin_sigma_m: float
-    pressure_deviation: float
-    pressure_deviation_sigma: float
-    damping_deviation: float
-    damping_deviation_sigma: float
     noise_m: float
     band_m: Floats | None = None
 

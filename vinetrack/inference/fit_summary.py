@@ -19,7 +19,15 @@ from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
-from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, OrNaN, numbers_text
+from vinetrack.inference.fit_result import (
+    BetweenTrialSpread,
+    Fit,
+    Number,
+    NumberTable,
+    OrNaN,
+    TrialEstimates,
+    numbers_text,
+)
 from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import FILM_ERROR, moved_by, robust_covariance, systematics_of
 
@@ -73,20 +81,6 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...
     affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= MATTERS]
     changes = [(numbers[k].title, moved[k], numbers[k].unit) for k in affected]
     return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
-
-
-@dataclass(frozen=True)
-class TrialEstimates:
-    """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
-
-    release_s: OrNaN = math.nan
-    release_sigma_s: OrNaN = math.nan
-    origin_m: OrNaN = math.nan
-    origin_sigma_m: OrNaN = math.nan
-    pressure_deviation: OrNaN = math.nan
-    pressure_deviation_sigma: OrNaN = math.nan
-    damping_deviation: OrNaN = math.nan
-    damping_deviation_sigma: OrNaN = math.nan
 
 
 def _array(content: Any) -> Floats:

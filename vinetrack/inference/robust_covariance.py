@@ -243,8 +243,7 @@ def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floa
     if trials < FEWEST_CLUSTERS:
         return np.zeros(single.shape[1])
     single = single - single.mean(axis=0)
-    by_trial = np.sum(single**2, axis=0) * trials / max(trials - fitted, 1)
-    return np.asarray(np.maximum(by_trial, np.diag(group_scatter(single, groups, fitted))))
+    return np.max([np.diag(group_scatter(single, each, fitted)) for each in (range(trials), groups)], axis=0)
 
 
 def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
@@ -345,7 +344,6 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     """
     problem, theta = solution.problem, solution.state.theta
     information, scores = trial_information(solution)
-    trials = len(scores)
     square = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (theta > problem.lower) & (theta < problem.upper)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
@@ -355,12 +353,10 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)
-    meat = scores.T @ scores * trials / max(trials - estimated.size, 1) + prior
-    robust = plain @ meat @ plain
     groups = coarsest_groups([trial_data.trial for trial_data in predictor.data])
-    if len(set(groups)) < trials:
-        by_group = plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
-        np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
+    meats = [group_scatter(scores, each, estimated.size) + prior for each in (range(len(scores)), groups)]
+    robust, by_group = (plain @ meat @ plain for meat in meats)
+    np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
     return plain, robust
 
 
@@ -382,13 +378,14 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
     return [str(i) for i in range(len(trials))]  # Not their names: a planned trial may be there several times
 
 
-def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
+def group_scatter(single: Floats, groups: Sequence[Hashable], fitted: int) -> Floats:
     """Variance of the sum of scores from the scatter of sums over groups, corrected for few groups. The correction is
     G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015). Shapes: single
     (n_trials, n_free) → (n_free, n_free).
     """
-    names = list(dict.fromkeys(groups))
-    sums = np.array([single[[group == name for group in groups]].sum(axis=0) for name in names])
-    count, trials = len(names), len(single)
+    of_trial = np.unique(np.asarray(groups), return_inverse=True)[1]
+    count, trials = of_trial.max() + 1, len(single)
+    sums = np.zeros((count, single.shape[1]))
+    np.add.at(sums, of_trial, single)
     factor = count / max(count - 1, 1) * (trials - 1) / max(trials - fitted, 1)
     return np.asarray(sums.T @ sums * factor)

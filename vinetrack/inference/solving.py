@@ -24,7 +24,6 @@ from vinetrack.inference.fit_result import (
     YIELD_PRESSURE,
     BetweenTrialSpread,
     Fit,
-    FreeParameter,
     Number,
     ParameterMap,
     TrialFit,
@@ -539,21 +538,17 @@ def _numbers(
                 **{name: getattr(number, name) for name in ("key", "vine", "symbol", "unit")},
                 value=number.from_scaled(float(theta[k])),
                 sigma=float(sigma[k]) * slope,
-                low=_bound_in_SI_units(number, low),
-                high=_bound_in_SI_units(number, high),
+                low=number.from_scaled(float(low)),
+                high=number.from_scaled(float(high)),
                 dof=float(dof[k]),
                 method=method,
-                bound=_bound_in_SI_units(number, at[0]) if at else math.nan,
-                lower=_bound_in_SI_units(number, problem.lower[k]),
-                upper=_bound_in_SI_units(number, problem.upper[k]),
+                bound=number.from_scaled(float(at[0])) if at else math.nan,
+                lower=number.from_scaled(float(problem.lower[k])),
+                upper=number.from_scaled(float(problem.upper[k])),
                 shared=shared if math.isfinite(sigma[k]) else {},
             )
         )
     return tuple(numbers)
-
-
-def _bound_in_SI_units(number: FreeParameter, theta: float) -> float:
-    return number.from_scaled(float(theta)) if math.isfinite(theta) else math.inf * theta
 
 
 def _in_SI_units(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
