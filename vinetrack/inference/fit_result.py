@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import html_table, plot
+from vinetrack.core.terminal import html_table, plot, table
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
@@ -516,16 +516,9 @@ class Fit(NumberTable):
         """Measured and predicted positions of all trials, one row per point."""
         import pandas as pd
 
+        columns = ("time_s", "lead_position_m", "predicted_position_m", "residual_m")
         parts = [
-            pd.DataFrame(
-                {
-                    "trial": trial.name,
-                    "time_s": trial.time_s,
-                    "lead_position_m": trial.lead_position_m,
-                    "predicted_position_m": trial.predicted_position_m,
-                    "residual_m": trial.residual_m,
-                }
-            )
+            pd.DataFrame({"trial": trial.name, **{column: getattr(trial, column) for column in columns}})
             for trial in self.trials
         ]
         return pd.concat(parts, ignore_index=True)
@@ -544,7 +537,8 @@ class Fit(NumberTable):
 
 def numbers_text(fit: Any) -> list[str]:
     """The numbers of a fit, its noise and its messages as lines of text."""
-    lines = aligned([("", "value", "error", "of it shared", "95 % interval", "unit"), *map(number_row, fit.numbers)])
+    head = ("", "value", "error", "of it shared", "95 % interval", "unit")
+    lines = table(map(number_row, fit.numbers), head, indent="  ", align="<><<<<")
     lines += [_spread_line(name, spread) for name, spread in fit.spreads.items()]
     lines.append(
         f"noise {fit.noise_m * 1e3:.3g} mm, correlation {fit.noise_correlation:.2f};"
@@ -567,19 +561,6 @@ def number_row(number: Number) -> tuple[str, ...]:
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
     error, shared = (f"± {sigma * factor:.{digits}f}" for sigma in (number.sigma, number.shared_sigma))
     return number.title, value, error, shared if number.shared else "", f"{low} to {high}", unit
-
-
-def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of texts as aligned lines; the second column, values, to the right, others to the left."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.rjust(width) if k == 1 else cell.ljust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append(f"  {'  '.join(cells)}".rstrip())
-    return lines
 
 
 def _spread_line(name: str, spread: BetweenTrialSpread) -> str:

@@ -539,7 +539,10 @@ def estimate_noise(
     n_freed = N_TRIAL_EFFECTS + problem.index.shape[1] if within else N_TRIAL_EFFECTS
     shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
     if within:
-        precision_scaled = np.concatenate([precision_scaled, _vague_precision(cross_products, n_freed)], axis=1)
+        information = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:n_freed]
+        # 1e-9: part of a trial's information at white noise that leaves the shared parameters free in it (derived)
+        vague = np.where(information > 0, 1e-9 * information, 1.0)
+        precision_scaled = np.concatenate([precision_scaled, vague], axis=1)
         prior_gradient = np.pad(prior_gradient, ((0, 0), (0, n_freed - N_TRIAL_EFFECTS)))
     columns = [*range(n_freed), cross_products.shape[-1] - 1]
     # 1e-6, 0.2: least part of the residual sum of squares that remains (derived)
@@ -557,13 +560,6 @@ def estimate_noise(
     if rho is None:
         return estimate_noise(cross_products, problem, state, _parabola_minimum(grid, scores, best), within=within)
     return rho, _shrink_to_common(squares[0], degrees[0])
-
-
-def _vague_precision(cross_products: Floats, n_freed: int) -> Floats:
-    """Prior precision that leaves the shared parameters free in each trial, shape (n_trials, n_keys)."""
-    information = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:n_freed]
-    # 1e-9: part of that trial's information at white noise (derived)
-    return np.asarray(np.where(information > 0, 1e-9 * information, 1.0))
 
 
 def _parabola_minimum(grid: Floats, scores: Floats, best: int) -> float:

@@ -396,9 +396,7 @@ def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
     """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1). The residual
     becomes r − C·change, the other columns stay.
     """
-    transformation = np.broadcast_to(
-        np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])
-    ).copy()
+    transformation = np.tile(np.eye(cross_products.shape[-1]), (len(cross_products), 1, 1))
     transformation[:, :-1, -1] = -change
     return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
 
@@ -498,9 +496,7 @@ def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitS
     problem = solution.problem
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     change = np.append(theta - state.theta, 0.0)[problem.index]
-    moved_products = solution.cross_products.copy()
-    # The residual after the step: r − X δ.
-    moved_products[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
+    moved_products = _products_after_step(solution.cross_products, np.pad(change, ((0, 0), (N_TRIAL_EFFECTS, 0))))
     trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)[0]
     return replace(state, theta=theta, trial_effects=trial_effects)
 

@@ -222,11 +222,7 @@ class ReleaseSearch:
         without a proposal stay as they are.
         """
         rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
-        predictor, problem, current = self.predictor, self.problem, state
-        if rows.size < len(predictor.data):
-            predictor, problem, (current, proposed) = subset(predictor, problem, rows, state, proposed)
-        else:
-            rows = np.arange(len(predictor.data))
+        predictor, problem, (current, proposed) = subset(self.predictor, self.problem, rows, state, proposed)
         # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
         for _ in range(3):
             proposed = optimise_trial_effects(predictor, problem, proposed)[0]
