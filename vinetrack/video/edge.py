@@ -42,7 +42,6 @@ from vinetrack.video.edge_state import (
     informative_frames,
     initial_state,
     moving_frames,
-    residuals,
     search_edges,
     seen_exposure,
 )
@@ -461,7 +460,7 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
         informative = informative_frames(state.edge)
         if iteration == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
-        state = find_shape(strip, state, fit, iteration == 0)
+        state = find_shape(strip, state, fit)
         if iteration > 0:
             state = find_shading(strip, state, fit)
         steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
@@ -649,17 +648,10 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
-    """Take over the fitted edges; re-estimate blur lengths, film and background, and the correlation of the noise.
-    `inflation` is the variance of a column's mean residual over that of white noise, by distance from the edge.
-    """
+    """Take over the fitted edges; re-estimate blur lengths, film and background."""
     edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
-    state = estimate_appearance(strip, state, 4 * strip.noise + 4)
-    by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
-    counted = by_distance[:, 1] > 4
-    ratio = np.where(counted, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
-    smoothed = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return replace(state, inflation=np.clip(smoothed, 0.3, 50.0))
+    return estimate_appearance(strip, state, 4 * strip.noise + 4)
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:

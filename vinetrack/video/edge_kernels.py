@@ -88,14 +88,14 @@ def coverage_reach(length: float, blur: float) -> float:
 
 
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
-def subpixel_index(place: float) -> tuple[int, int, float, int]:
+def subpixel_index(place: float) -> tuple[int, int, float]:
     """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
-    fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
+    fraction; weight of entry j + 1.
     """
     whole = math.floor(place)
     fraction = (place - whole) / TABLE_STEP_PX
     j = min(int(fraction), SUBPIXEL_STEPS - 1)
-    return int(whole), j, fraction - j, 0 if fraction > 0 else 1
+    return int(whole), j, fraction - j
 
 
 COLUMNS_BEHIND = 25  # Columns behind the first passed one that are used (chosen)
@@ -137,20 +137,18 @@ def film_evidence(
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def fit_edges(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, start: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
-    blur: float, appearance: np.ndarray, inflation: np.ndarray, prior_sd: float, margin: float, rounds: int,
+    blur: float, appearance: np.ndarray, prior_sd: float, margin: float, rounds: int,
     shading: np.ndarray, frames: np.ndarray, rows: tuple[int, int],
 ) -> np.ndarray:  # fmt: skip
     """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6). Columns of
     the result: edge, its standard error from the Fisher information, mean squared weighted residual, amplitude − 1,
-    level, number of pixels. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along); inflation
-    (n_bins,).
+    level, number of pixels. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along).
     """
     columns = strip.shape[2]
     out = np.full((len(frames), 6), np.nan)
     max_lag = lag[rows[0] : rows[1]].max()
     half, middle, table_length = 0.0, 0, -1.0
-    table, bin_inflation = np.empty((0, 0, 0), np.float32), np.empty(0, np.float32)
-    shading32 = shading.astype(np.float32)
+    table, shading32 = np.empty((0, 0, 0), np.float32), shading.astype(np.float32)
     for i in range(len(frames)):
         t, y = frames[i], start[i]
         if not math.isfinite(y):
@@ -161,16 +159,13 @@ def fit_edges(
             half = coverage_reach(length, blur) + margin
             table = coverage_table(length, blur, half).astype(np.float32)
             middle = math.ceil(half) + 1
-            bin_inflation = np.empty(table.shape[2] + 1, np.float32)
-            for k in range(len(bin_inflation)):
-                bin_inflation[k] = inflation[min(max(len(inflation) // 2 - middle + k - 1, 0), len(inflation) - 1)]
         amplitude, level = 0.0, 0.0
         for _ in range(rounds):
             first = max(0, math.ceil(y - half - max_lag))
             last = min(columns, int(y + half) + 1)
             used, (yy, yg, yl, gg, gl, ll, ry, rg, rl, chi) = _normal_sums(
                 strip[t], rows, np.float32(scale[t]), np.float32(offset[t]), appearance, y, lag, half, first, last,
-                middle, table, bin_inflation, shading32, np.float32(1 + amplitude), np.float32(level),
+                middle, table, shading32, np.float32(1 + amplitude), np.float32(level),
             )  # fmt: skip
             yy, gg, ll = yy + 1e-12, gg + prior_sd**-2, ll + prior_sd**-2
             rg, rl = rg - amplitude * prior_sd**-2, rl - level * prior_sd**-2
@@ -199,26 +194,26 @@ def fit_edges(
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)
 def _normal_sums(
     picture: np.ndarray, rows: tuple[int, int], scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float,
-    lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
-    shading: np.ndarray, gain: np.float32, level: np.float32,
+    lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray,
+    gain: np.float32, level: np.float32,
 ) -> tuple[int, tuple[float, float, float, float, float, float, float, float, float, float]]:  # fmt: skip
     """Number of pixels near the edge, and over them the sums of the normal equations for edge, amplitude and level. The
     last sum is that of squared residuals, weighted. The weights 1/(variance + r²/9), as of Student's t with nine
-    degrees of freedom, limit the influence of outliers.
+    degrees of freedom, limit the influence of outliers; the shading of the tip, one for all rows, is known to a
+    third of itself.
     """
     zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
     yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = zero
     used = 0
     for u in range(rows[0], rows[1]):
         row_edge = y - lag[u]
-        whole_px, j, table_fraction, on_grid = subpixel_index(row_edge)
+        whole_px, j, table_fraction = subpixel_index(row_edge)
         a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
         if b <= a:
             continue
         k, m = a - whole_px + middle, b - a
         low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
         low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-        inflation = bin_inflation[k + on_grid : k + on_grid + m]
         values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
         film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
         f, fraction = np.float32(table_fraction), np.float32(row_edge - whole_px)
@@ -229,12 +224,13 @@ def _normal_sums(
             slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
             contrast = film[i] - background[i]
             shading_slope = shade_before[i] - shade_after[i]
-            excess = np.float32(values[i]) * scale + offset - background[i] - shade_after[i] - fraction * shading_slope
-            variance = (p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]) * inflation[i]
+            shade = shade_after[i] + fraction * shading_slope
+            excess = np.float32(values[i]) * scale + offset - background[i] - shade
+            variance = p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
             dg = contrast * p
             dy = contrast * gain * slope + shading_slope
             r = excess - gain * dg - contrast * level
-            w = unit / (variance + r * r * ninth)
+            w = unit / (variance + (r * r + shade * shade) * ninth)
             wy, wg, wl = w * dy, w * dg, w * contrast
             yy += wy * dy
             yg += wy * dg
@@ -368,33 +364,28 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
 def residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Sums over the pixels about the edge, with r the residual and w its weight, each frame by itself, so that frames
     may be shared among threads and no result depends on their number. Shapes: fit (n_frames, 6); frames (n_used,).
 
     By row: Σ w g r and Σ w g², g the derivative of the model with respect to the row's lag, shape (n_used, n_across,
-    2). By distance from the row's own edge, in the bins of `shading`: Σ w r and Σ w, shape (n_used, 2, n_distances). By
-    distance from the edge, 1 px a bin, edge at the middle bin: z² / var z of columns, z = Σ C r / v over their rows (C
-    the contrast, v the variance), and the number of terms, shape (n_used, n_bins, 2). In all: log(1 + r²/9v), v the
+    2). By distance from the row's own edge, in the bins of `shading`: Σ w r and Σ w, shape (n_used, 2, n_distances). In
+    all: log(1 + r²/9v), v the
     mean of the variances of film and background, and the number of pixels, shape (n_used, 2): a robust misfit for
     comparing blurs, since v does not depend on the blur; otherwise a wider one would lower its own misfit.
     """
     _, rows, columns = strip.shape
-    bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
     by_row, by_place = np.zeros((len(frames), rows, 2)), np.zeros((len(frames), 2, len(shading)))
-    by_distance, misfit = np.zeros((len(frames), bins, 2)), np.zeros((len(frames), 2))
-    residuals, weights = np.empty(columns), np.empty(columns)
+    misfit, residuals, weights = np.zeros((len(frames), 2)), np.empty(columns), np.empty(columns)
     for used in range(len(frames)):
         t = frames[used]
         y, length, gain, level = fit[t, 0], lengths[t], 1 + fit[t, 3], fit[t, 4]
         half = coverage_reach(length, blur) + margin
         table, middle = coverage_table(length, blur, half), math.ceil(half) + 1
         first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
-        # Indexed by k, the position in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
-        column_sums = np.zeros((2, table.shape[2] + 1))
         for u in range(rows):
             row_edge = y - lag[u]
-            whole_px, j, f, on_grid = subpixel_index(row_edge)
+            whole_px, j, f = subpixel_index(row_edge)
             a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
             if b <= a:
                 continue
@@ -435,15 +426,4 @@ def residual_sums(
                     weighted_of[i] += part * weight[i] * residual[i]
                 for i in range(m):
                     weight_of[i] += part * weight[i]
-            bins_here = slice(k + on_grid, k + on_grid + m)
-            numerators, denominators = column_sums[0, bins_here], column_sums[1, bins_here]
-            for i in range(m):
-                numerators[i] += weight[i] * (film[i] - background[i]) * residual[i]
-            for i in range(m):
-                denominators[i] += weight[i] * (film[i] - background[i]) * (film[i] - background[i])
-        for k in range(column_sums.shape[1]):
-            if column_sums[1, k] > 0:
-                i = min(max(bins // 2 - middle + k - 1, 0), bins - 1)
-                by_distance[used, i, 0] += column_sums[0, k] * column_sums[0, k] / column_sums[1, k]
-                by_distance[used, i, 1] += 1
-    return by_row, by_place, by_distance, misfit
+    return by_row, by_place, misfit

@@ -39,7 +39,6 @@ class EdgeState:
     lag: Floats
     blur: float
     appearance: NDArray[np.float32]
-    inflation: Floats
     shading: Floats = field(default_factory=lambda: np.zeros(2 * SHADING_REACH_PX + 1))
 
 
@@ -166,7 +165,7 @@ def search_edges(
     def fits(first: int, last: int) -> Floats:
         return kernels.fit_edges(
             strip.values, strip.scale, strip.offset, starts[first:last], state.lengths, state.lag, state.blur,
-            state.appearance, state.inflation, contrast_prior_sd, MARGIN_PX, rounds, shading, frames[first:last], rows,
+            state.appearance, contrast_prior_sd, MARGIN_PX, rounds, shading, frames[first:last], rows,
         )  # fmt: skip
 
     return np.concatenate(in_parts(fits, len(frames), FEWEST_FITS))
@@ -183,13 +182,12 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
 
 
 class Residuals(NamedTuple):
-    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances),
-    (n_bins, 2) and (2,).
+    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances)
+    and (2,).
     """
 
     by_row: Floats
     by_place: Floats
-    by_distance: Floats
     misfit: Floats
 
 
@@ -217,7 +215,7 @@ def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: f
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
     """Estimate film and background from an initial path of the front, with a straight tip and a typical blur."""
     blank = np.zeros((4, *strip.values.shape[1:]), np.float32)
-    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(blank.shape[1]), 2.0, blank, np.ones(3))
+    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(blank.shape[1]), 2.0, blank)
     return estimate_appearance(strip, state, 0.0)
 
 
@@ -229,7 +227,7 @@ ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (cho
 OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
 
 
-def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) -> EdgeState:
+def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur. Both come from
     the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
     them. Shapes: fit (n_frames, 6).
@@ -245,9 +243,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
         state = replace(state, lag=lag, edge=state.edge - lead)
     # 16: frames from which the blur is estimated (chosen)
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
-    # Blurs that are tried: any, or near the last estimate, as a part of it (chosen)
-    candidates = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8] if everywhere else [0.7, 0.85, 1, 1.2, 1.4])
-    candidates = candidates if everywhere else state.blur * candidates
+    candidates = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])  # Blurs that are tried, px (chosen)
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
     misfits = []
