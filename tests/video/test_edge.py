@@ -18,7 +18,7 @@ from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video import edge
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.edge import BANDS, leap_error_px
+from vinetrack.video.edge import BANDS
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
@@ -414,18 +414,3 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey):
     assert not usable[(frames > 12) & (true < 138)].any()
     assert usable[true > 150].all()
     assert np.abs(error[usable]).max() < 0.1
-
-
-def test_a_followed_door_is_off_by_its_distance_from_the_extrapolated_motion_and_a_tip_by_nothing():
-    """Hidden frames that do not lead up to the motion after them, and those that do: a tip followed from rest."""
-    frames, noise = np.arange(40.0), np.random.default_rng(351).normal(0, 0.1, 40)
-    for frame in (8.0, 8.99, 8.3):
-        moved = np.clip(frames - frame, 0.0, None)  # at rest at 100 px until a moment between frames
-        true = 100.0 + 0.5 * 3.0 * moved**2
-        for tip in (true + noise, 100.0 + 20.0 * moved):
-            assert leap_error_px(tip, frames < 14).max() == 0.0
-    edge = np.where(frames < 14, 130.0 + 0.8 * frames, true)  # the tip comes out at frame 14, at 149 px
-    error = leap_error_px(edge, frames < 16)
-    assert error[14:].max() == 0.0
-    assert error[:14] == pytest.approx(np.abs(edge - true)[:14], abs=6.0)
-    assert error[:10].min() > 20.0

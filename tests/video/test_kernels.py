@@ -1,4 +1,4 @@
-"""Compiled loops against plain ones, NumPy and OpenCV, on any number of threads."""
+"""Compiled loops against plain ones, NumPy and OpenCV."""
 
 import os
 import subprocess
@@ -6,10 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from pictures import tracked
-from plain_scene import Plan, plain_scene
 
-from vinetrack.core import threads
 from vinetrack.video import edge_kernels as kernels
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
@@ -54,21 +51,3 @@ def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and
     run = [sys.executable, "-c", FITS]
     first, later = (subprocess.run(run, env=os.environ | where, capture_output=True, check=True) for _ in range(2))
     assert first.stdout == later.stdout
-
-
-@pytest.mark.parametrize(("stated", "expected"), [("1", 1), ("2", 2), ("64", 4), ("", 4), ("0", 4), ("many", 4)])
-def test_the_usual_variable_limits_the_threads(monkeypatch, stated, expected):
-    monkeypatch.setattr(threads, "available_cores", lambda: 8)
-    monkeypatch.setenv("OMP_NUM_THREADS", stated)
-    assert threads.n_threads() == expected
-
-
-def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(monkeypatch):
-    luma = plain_scene(Plan(seed=13, end_px=300, width=420, rest_frames=20, end_frames=20)).frames
-    found = []
-    for number in (1, 3):
-        monkeypatch.setattr(threads, "n_threads", lambda number=number: number)
-        found.append(tracked(luma, 0.5).track)
-    assert np.isfinite(found[0].edge_px).sum() > 20
-    for name in ("edge_px", "lead_position_sigma_m", "lead_position_systematic_m", "flag"):
-        np.testing.assert_array_equal(*(getattr(track, name) for track in found))

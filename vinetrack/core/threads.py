@@ -1,8 +1,7 @@
-"""Compiled loops over frames, rows or pixels in several threads; no result depends on their number."""
+"""Compiled functions, and the threads of a process that run them; no result depends on their number."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -52,27 +51,3 @@ def _one_blas_thread() -> Iterator[None]:
 # Decorates a function so that linear algebra in it uses one thread; afterwards as many as before. The matrices of a
 # fit are too small to be shared out: threads that wait for each other cost processor time.
 in_one_blas_thread = _one_blas_thread()
-
-MOST_THREADS = 4  # Most threads of one recording (chosen)
-FEWEST_PICTURES = 16  # Fewest pictures for which another thread is used (chosen)
-
-
-def n_threads() -> int:
-    """Number of threads that the tracking of a recording may use: 1 in a worker process, beside which others track, and
-    at most OMP_NUM_THREADS, which the workflow sets to 1, since it tracks as many at a time as there are cores.
-    """
-    if multiprocessing.parent_process() is not None:
-        return 1
-    stated = os.environ.get("OMP_NUM_THREADS", "")
-    limit = int(stated) if stated.isdigit() and int(stated) > 0 else MOST_THREADS
-    return min(available_cores(), limit, MOST_THREADS)
-
-
-def in_parts(work: Callable[[int, int], Part], count: int, least: int) -> list[Part]:
-    """Call `work(first, one behind the last)` for consecutive parts of a range, side by side."""
-    threads = 1 if count < 2 * least else min(n_threads(), count // least)
-    if threads == 1:
-        return [work(0, count)]
-    cuts = [count * k // threads for k in range(threads + 1)]
-    others = [thread_pool(MOST_THREADS - 1).submit(work, cuts[k], cuts[k + 1]) for k in range(1, threads)]
-    return [work(0, cuts[1]), *(other.result() for other in others)]

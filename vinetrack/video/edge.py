@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
-from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
@@ -330,76 +329,25 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
-def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
-    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it. What
-    swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
-    Shapes: edge (n_frames,) → (n_frames,).
-    """
-    speed_gain = 0.3  # Gain of speed over the next four frames (chosen)
-    out = np.zeros(len(edge))
-    if hidden.all():
-        return out
-    steps = np.diff(edge)
-    bends = np.diff(steps)  # bends[t] is the change between the steps from t and from t + 1
-    for t in range(int(np.argmin(hidden)) - 1, -1, -1):
-        later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
-        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > speed_gain * steps[t + 1]:
-            continue
-        # 3.0: ratio of a change of the step to the largest of the next four above which it is a leap (chosen)
-        if abs(bends[t]) <= max(3.0 * np.abs(later).max(), ASTRAY_PX):
-            continue
-        back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
-        out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
-        break
-    return np.nan_to_num(out)
-
-
 # ------------------------------------------------------------------------------
 # Initial path of the front through a strip, before film, background or the tip are known.
 #
-# Two methods of `kymograph` complement each other. The path by change does not know what caused a change: a bright
-# door that comes to rest beside the tube outweighs the front. The path by appearance lets every pixel vote on whether
-# it looks as in the first or as in the last frames; votes are equal and a door has few rows. But a payload that has
-# flown past by the end, or an object that stood in front at the start, has no vote, and the path starts up to three
-# frames late and ends up to three frames early, because several frames are averaged at either end. The path that
-# leaves the smaller residual sum is used.
+# Every pixel votes on whether it looks as in the first or as in the last frames; votes are equal, and a door that comes
+# to rest beside the tube has few rows. But a payload that has flown past by the end, or an object that stood in front
+# at the start, has no vote, and the path starts up to three frames late and ends up to three frames early, because
+# several frames are averaged at either end.
 
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[np.float32]]:
-    """Find the initial path of the front, by change or by appearance, whichever leaves the smaller residual sum, and
-    the columns that it leaves permanently changed; a payload may fly on beyond the end of the film. Returns column of
-    the front by frame, shape (n_frames,), px; first column passed, and the one behind the last; and brightness of film
-    and background, shape (2, n_across, n_along).
+    """Find the initial path of the front and the columns that it leaves permanently changed; a payload may fly on
+    beyond the end of the film. Returns column of the front by frame, shape (n_frames,), px; first column passed, and
+    the one behind the last; and brightness of film and background, shape (2, n_across, n_along).
     """
-    candidates: list[tuple[Floats, tuple[int, int]]] = []
-    errors: list[ValueError] = []
-    for path, change in (ky.path_by_change(strip), ky.path_by_appearance(strip)):
-        try:
-            candidates.append(_trim_to_changed_runs(path, change))
-        except ValueError as error:
-            errors.append(error)
-    if not candidates:
-        raise errors[0]
-    columns = min(first for _, (first, _) in candidates), max(last for _, (_, last) in candidates)
-    looks = [initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2] for path, _ in candidates]
-
-    def residual(path: Floats, look: NDArray[np.float32]) -> float:
-        """Residual sum of a path over those columns, with the film and background that follow from it."""
-
-        def residuals_of(first: int, last: int) -> Floats:
-            part = slice(first, last)
-            return ky.clipped_residual_sums(
-                strip.values[part], strip.scale[part], strip.offset[part], strip.noise, path[part], look, *columns
-            )
-
-        return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
-
-    best = int(np.argmin([residual(path, look) for (path, _), look in zip(candidates, looks, strict=True)]))
-    path, passed = candidates[best]
+    path, passed = _trim_to_changed_runs(*ky.path_by_appearance(strip))
     end = growth_end(strip, path, passed)
     if end <= passed[0]:
         raise ValueError("what changes along the axis does not stay changed: nothing grows")
-    return path, (passed[0], end), looks[best]
+    return path, (passed[0], end), initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2]
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -410,8 +358,8 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
     # Length of a run of columns, and the fraction of it that must have changed for a front to have passed
     # (chosen)
     run_length_px, run_changed_part = 9, 0.6
-    # 5.0: change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
-    strong = change > 5.0
+    # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
+    strong = change > 70.0
     run = np.convolve(strong, np.ones(run_length_px) / run_length_px, mode="same") > run_changed_part
     if run.sum() < run_length_px:
         raise ValueError("nothing moves along the axis")
@@ -635,14 +583,7 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
     evidence_clip = 2.5
     contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
-
-    def evidence_of(first: int, last: int) -> NDArray[np.float32]:
-        part = slice(first, last)
-        return kernels.film_evidence(
-            strip.values[part], strip.scale[part], strip.offset[part], state.appearance, width, evidence_clip
-        )
-
-    evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
+    evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, state.appearance, width, evidence_clip)
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
@@ -687,7 +628,6 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     extra = np.where(in_mouth, np.maximum(extra, NO_EDGE_PX if moved_behind else GUESSED_PX), extra)
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | in_mouth
-    extra = np.maximum(extra, leap_error_px(edge_now, hidden))
     # Unsure is a poor fit: odd contrast, large misfit, disagreeing bands, hidden, uncertain.
     # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
     misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)

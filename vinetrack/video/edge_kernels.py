@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from vinetrack.core.threads import in_parts, njit
+from vinetrack.core.threads import njit
 
 # ------------------------------------------------------------------------------
 # Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).
@@ -275,31 +275,24 @@ def gather(
     limits[~counted.any(axis=1)] = 0
     sums = np.zeros((2, 3, *strip.shape[1:]), np.float32)
     clip_weight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
-
-    def gather_rows(first: int, last: int) -> None:
-        _gather_rows(
-            strip, scale, offset, edge, reach, lag, weights, limits, appearance, clip_weight, shading, first, last,
-            sums,
-        )  # fmt: skip
-
-    in_parts(gather_rows, strip.shape[1], ROWS_PER_BLOCK)
+    _gather(strip, scale, offset, edge, reach, lag, weights, limits, appearance, clip_weight, shading, sums)
     return sums
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def _gather_rows(
+def _gather(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, reach: np.ndarray, lag: np.ndarray,
     weights: np.ndarray, limits: np.ndarray, appearance: np.ndarray, clip_weight: np.float32, shading: np.ndarray,
-    first_row: int, last_row: int, sums: np.ndarray,
+    sums: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add rows `first_row` up to `last_row`, that one excluded, to `sums`; see `gather`."""
+    """Add all frames to `sums`; see `gather`."""
     n, centre, unit = len(strip), (len(shading) - 1) // 2, np.float32(1.0)
     brightness = np.empty(strip.shape[2], np.float32)
-    for block in range(first_row, last_row, ROWS_PER_BLOCK):
+    for block in range(0, strip.shape[1], ROWS_PER_BLOCK):
         for t in range(n):
             first, last = limits[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
-            for u in range(block, min(block + ROWS_PER_BLOCK, last_row)):
+            for u in range(block, min(block + ROWS_PER_BLOCK, strip.shape[1])):
                 row_edge = edge[t] - lag[u]
                 behind = min(max(math.ceil(row_edge - reach[t]), first), last)
                 ahead = min(max(math.floor(row_edge + reach[t]) + 1, first), last)
@@ -365,14 +358,14 @@ def residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Sums over the pixels about the edge, with r the residual and w its weight, each frame by itself, so that frames
-    may be shared among threads and no result depends on their number. Shapes: fit (n_frames, 6); frames (n_used,).
+    """Sums over the pixels about the edge, with r the residual and w its weight, each frame by itself. Shapes: fit
+    (n_frames, 6); frames (n_used,).
 
     By row: Σ w g r and Σ w g², g the derivative of the model with respect to the row's lag, shape (n_used, n_across,
     2). By distance from the row's own edge, in the bins of `shading`: Σ w r and Σ w, shape (n_used, 2, n_distances). In
-    all: log(1 + r²/9v), v the
-    mean of the variances of film and background, and the number of pixels, shape (n_used, 2): a robust misfit for
-    comparing blurs, since v does not depend on the blur; otherwise a wider one would lower its own misfit.
+    all: log(1 + r²/9v), v the mean of the variances of film and background, and the number of pixels, shape (n_used,
+    2): a robust misfit for comparing blurs, since v does not depend on the blur; otherwise a wider one would lower its
+    own misfit.
     """
     _, rows, columns = strip.shape
     by_row, by_place = np.zeros((len(frames), rows, 2)), np.zeros((len(frames), 2, len(shading)))

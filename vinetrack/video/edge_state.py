@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
-from vinetrack.core.threads import in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.strip import Strip
@@ -22,7 +21,6 @@ TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
-FEWEST_FITS = 4  # Fewest fits, or frames summed over, for which another thread is used (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
@@ -161,14 +159,10 @@ def search_edges(
     """
     contrast_prior_sd = 0.15  # Prior deviation of relative amplitude and level of the contrast in one frame (chosen)
     shading, rows = _padded_shading(state, MARGIN_PX), rows or (0, strip.values.shape[1])
-
-    def fits(first: int, last: int) -> Floats:
-        return kernels.fit_edges(
-            strip.values, strip.scale, strip.offset, starts[first:last], state.lengths, state.lag, state.blur,
-            state.appearance, contrast_prior_sd, MARGIN_PX, rounds, shading, frames[first:last], rows,
-        )  # fmt: skip
-
-    return np.concatenate(in_parts(fits, len(frames), FEWEST_FITS))
+    return kernels.fit_edges(
+        strip.values, strip.scale, strip.offset, starts, state.lengths, state.lag, state.blur, state.appearance,
+        contrast_prior_sd, MARGIN_PX, rounds, shading, frames, rows,
+    )  # fmt: skip
 
 
 def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
@@ -195,15 +189,11 @@ def residuals(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px
     """Sum what a fit leaves over the frames of `use`. Shapes: fit (n_frames, 6); use (n_frames,)."""
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
-
-    def sums(first: int, last: int) -> tuple[Floats, ...]:
-        return kernels.residual_sums(
-            strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
-            margin_px, frames[first:last], shading,
-        )  # fmt: skip
-
-    parts = in_parts(sums, len(frames), FEWEST_FITS)
-    return Residuals(*(np.concatenate(part).sum(axis=0) for part in zip(*parts, strict=True)))
+    sums = kernels.residual_sums(
+        strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
+        margin_px, frames, shading,
+    )  # fmt: skip
+    return Residuals(*(of_frames.sum(axis=0) for of_frames in sums))
 
 
 def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> float:
