@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats, Indices
+from vinetrack.core.records import Bools, Floats
 from vinetrack.video.frames import RecordingError
+from vinetrack.video.kymograph import dividing_path
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
@@ -174,36 +175,8 @@ def _coarse_path(
     half = int(np.clip(0.8 * width, 6, columns // 5))
     box = np.ones(2 * half + 1)
     score = np.stack([np.convolve(row, box, mode="same") for row in foreground])
-    return _forward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half, background
-
-
-def _forward_path(score: Floats) -> Floats:
-    """Place by frame, shape (n_frames,), that collects most score, by dynamic programming; steps back have a cost."""
-    back_cost_per_px = 0.05  # Cost of a step back on the coarse path (chosen)
-    n, columns = score.shape
-    best = np.zeros_like(score)
-    came_from = np.zeros(score.shape, dtype=int)
-    best[0] = score[0]
-    cost = back_cost_per_px * np.arange(columns)
-    for t in range(1, n):
-        ahead, ahead_from = _running_maximum(best[t - 1])
-        behind, behind_from = _running_maximum((best[t - 1] - cost)[::-1])
-        behind, behind_from = behind[::-1] + cost, columns - 1 - behind_from[::-1]
-        came_from[t] = np.where(ahead >= behind, ahead_from, behind_from)
-        best[t] = np.maximum(ahead, behind) + score[t]
-    path = np.zeros(n)
-    place = int(np.argmax(best[-1]))
-    for t in range(n - 1, -1, -1):
-        path[t] = place
-        place = came_from[t, place]
-    return path
-
-
-def _running_maximum(values: Floats) -> tuple[Floats, Indices]:
-    """Largest value up to each place, and its index."""
-    running = np.maximum.accumulate(values)
-    is_new = np.concatenate([[True], values[1:] > running[:-1]])
-    return running, np.maximum.accumulate(np.where(is_new, np.arange(values.size), 0))
+    # The path that collects most score without a step back divides minus the slope of the score.
+    return dividing_path(-np.diff(score, axis=1, prepend=0.0)) - 1, half, background
 
 
 def _patch(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:
