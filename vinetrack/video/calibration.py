@@ -358,21 +358,14 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
     """Fit a plane to each view and a common lens; also return the root mean square reprojection error, px. Shapes:
     views (n, 2).
     """
+    import cv2
     from scipy.optimize import least_squares
 
     size = (width_px, height_px)
     corners = [_half_diagonals(picture, size) for picture, _ in views]
     reach_m = max(float(np.ptp(board, axis=0).max()) for _, board in views)
     places = [board / reach_m for _, board in views]
-    start = []
-    for corner, place in zip(corners, places, strict=True):  # by the direct linear transform
-        homogeneous = np.column_stack([corner, np.ones(len(corner))])
-        zeros = np.zeros_like(homogeneous)
-        system = np.block(
-            [[homogeneous, zeros, -place[:, :1] * homogeneous], [zeros, homogeneous, -place[:, 1:] * homogeneous]]
-        )
-        homography = np.linalg.eigh(system.T @ system)[1][:, 0]
-        start.append(homography[:8] / homography[8])
+    start = [cv2.findHomography(corner, place)[0].ravel()[:8] for corner, place in zip(corners, places, strict=True)]
     values = np.concatenate([*start, np.zeros(N_LENS)])
     unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
