@@ -144,12 +144,13 @@ LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0)
 @pytest.fixture(scope="module")
 def few():
     design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
-    return design, power_with(design, nonlinear=True)
+    tests = planned_tests(design)[0]
+    return design, tests, linear_power.power_of(tests, nonlinear=True)
 
 
 def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_come_in_pairs_and_are_few(few):
-    design, power = few
-    further = advice.further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
+    design, tests, power = few
+    further = advice.further_trials(tests, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
     pressures = [1e3 * added["pressure_kPa"] for added in further.trials]
     like = design.trials[0]
@@ -164,9 +165,9 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
 
 
 def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(few):
-    design, power = few
-    assert advice.further_trials(design, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS).trials == ()
-    never = advice.further_trials(design, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
+    _, tests, power = few
+    assert advice.further_trials(tests, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS).trials == ()
+    never = advice.further_trials(tests, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
 

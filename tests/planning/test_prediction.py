@@ -15,7 +15,7 @@ from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
-from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
+from vinetrack.planning.candidate_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, grown
 from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 

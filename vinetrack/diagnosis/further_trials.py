@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,35 +20,87 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
-from vinetrack.diagnosis.misfit_tests import MisfitTests
+from vinetrack.diagnosis.misfit_tests import MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
+from vinetrack.diagnosis.score_test import Products, products_without_trial_effects, scores_of
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, Fit
-from vinetrack.inference.marginal_likelihood import at_unknowns
+from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.marginal_likelihood import at_unknowns, solve_per_trial
 from vinetrack.inference.trial_effects import subset
-from vinetrack.planning.discriminating_design import (
+from vinetrack.planning.candidate_trials import (
     NEW_VINE,
     OTHER_RIG,
     SAME_RIG,
     Condition,
-    Hypothesis,
+    at_solution,
     conditions_by_effort,
-    exchanged,
-    extend,
+    extended_fit,
     feasible_conditions,
-    growth_courses,
-    refit_terms,
-    separations,
+    filmed,
     simulated_rises,
-    worth,
 )
-from vinetrack.planning.predictive_inputs import prior_ratio
+
+# ------------------------------------------------------------------------------
+# Information of designs, by linear theory.
+#
+# With trial effects eliminated, a trial is a quadratic form in the unknowns of a campaign and in what is asked about
+# it, and forms add up. Of a design with n_c trials of condition c, and the trials so far,
+#
+#     M = M_prior + M_so_far + Σ_c n_c M_c,   I = M_aa − M_aν M_νν⁻¹ M_νa
+#
+# is what the unknowns ν leave of the wanted columns a. Where these are the shape of an effect, I is the information
+# about its size. Where they are by how much the trials move if another hypothesis is true, the diagonal of I is what a
+# refit does not explain, in squared standard deviations.
+
+
+class Designs:
+    """Quadratic forms of the trials of a fit from the `n_before`-th on, shape (n_conditions, n, n), and of those so
+    far, (n, n): unknowns, then the wanted ones among the shapes.
+    """
+
+    def __init__(self, fit: Fit, products: Products, n_before: int, wanted: Sequence[int]) -> None:
+        problem, self.n_unknowns = products.problem, products.problem.prior_mean.size
+        size = self.n_unknowns + len(wanted)
+        residual_and_shapes = np.full(1 + products.n_shapes, -1)
+        residual_and_shapes[1 + np.array(wanted)] = np.arange(self.n_unknowns, size)
+        index = np.hstack([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))])
+        of_trials = at_unknowns(products_without_trial_effects(products, fit.state), index, size)
+        # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
+        # (chosen); what is asked about has none
+        prior = np.append(np.maximum(problem.prior_precision, 1e-6), np.zeros(len(wanted)))
+        self.so_far, self.each = np.diag(prior) + of_trials[:n_before].sum(axis=0), of_trials[n_before:]
+
+    def left(self, design: Sequence[int], added: NDArray[np.intp] | None = None, times: float = 1.0) -> Floats:
+        """What the unknowns leave of the wanted columns by a design, and one of each `added` with it, each trial made
+        so many times. Shapes: design (n_trials,), added (n_designs,) → (n_designs or 1, n_wanted, n_wanted).
+        """
+        total = (self.so_far + times * self.each[list(design)].sum(axis=0))[None]
+        total = total if added is None else total + times * self.each[added]
+        free, a = slice(None, self.n_unknowns), slice(self.n_unknowns, None)
+        explained = total[:, a, free] @ solve_per_trial(total[:, free, free], total[:, free, a])
+        return np.asarray(total[:, a, a] - explained)
+
+
+Criterion = Callable[..., Floats]  # Worth of designs, shape (n_designs,), by the arguments of `Designs.left`
+
+
+def exchanged(design: Sequence[int], allowed: NDArray[np.intp], worth: Criterion) -> list[int]:
+    """Exchange the trials of a design one at a time for others of those allowed until none gains."""
+    design, best = list(design), float(worth(design)[0])
+    for _ in range(4):
+        before = best
+        for k in range(len(design)):
+            values = worth(design[:k] + design[k + 1 :], allowed)
+            if np.max(values) > (1 + 1e-6) * best:  # a gain, not rounding
+                design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
+        if best <= before:
+            break
+    return design
+
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -115,11 +167,15 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     if differ and all(effect.kind == "measurement" for effect in differ):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
-    terms = _feasible_trials(tied, names, limits)
-    if not terms:
+    films = filmed(tied, feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits))
+    if not films:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
-    design, rises = _best_option(terms, limits, seed)
-    return _recommendation(terms, design, rises, seed)
+    try:
+        designs = _designs_of(tied, [extended_fit(fit, films) for fit in tied])
+    except SimulationError as error:
+        raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
+    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits, seed)
+    return _recommendation(tied, names, design, rises, seed)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -134,46 +190,58 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     return remark("deciding_measurements", effects=measured or list(effects.values())) if effects else Remark()
 
 
-def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[Hypothesis]:
-    """All hypotheses, extended to the conditions that can be filmed; none without any."""
-    conditions = feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits)
-    if not conditions:
-        return []
-    courses = growth_courses([extend(fit, name, conditions) for fit, name in zip(tied, names, strict=True)])
-    usable = [(condition, course) for condition, course in zip(conditions, courses, strict=True) if course is not None]
-    if not usable:
-        return []
-    chosen, chosen_courses = zip(*usable, strict=True)
-    try:
-        return refit_terms([extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)], chosen_courses)
-    except SimulationError as error:
-        raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
+def _designs_of(tied: Sequence[Fit], extended: Sequence[Fit]) -> list[Designs]:
+    """The forms of each hypothesis once refitted; wanted is by how much trials move if another one is true."""
+    count, designs = len(tied[0].trials), []
+    for fit in extended:
+        columns = []
+        for i, of_fit in enumerate(fit.solution.columns):
+            moved = [of_fit[:, -1] - other.solution.columns[i][:, -1] for other in extended]
+            columns.append(
+                np.column_stack([of_fit, *moved]) if i >= count else np.pad(of_fit, ((0, 0), (0, len(tied))))
+            )
+        products = Products(tuple(columns), fit.predictor.data, fit.solution.problem, len(tied))
+        designs.append(Designs(fit, products, count, range(len(tied))))
+    return designs
 
 
-def _best_option(terms: list[Hypothesis], limits: Limits, seed: int) -> tuple[list[int], Floats]:
-    """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
-    exchanged one at a time. Returns design (indices of conditions, one a trial), rises (see `simulated_rises`).
+def worth(between: Floats) -> Floats:
+    """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions
+    (T-optimality). Shapes: between (n_designs, n, n), in standard deviations → (n_designs,).
     """
-    conditions = terms[0].conditions
+    first, second = np.triu_indices(between.shape[1], 1)
+    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
+    # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
+    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
 
-    def worth_of(others: Sequence[int], places: NDArray[np.intp], replicates: int = 1) -> Floats:
-        return worth(separations(terms, [[*others, *[k] * replicates] for k in places]))
+
+def _best_option(
+    tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits, seed: int
+) -> tuple[list[Condition], Floats]:
+    """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
+    exchanged one at a time. Returns design, rises (see `simulated_rises`).
+    """
+
+    def worth_of(*design: Any) -> Floats:
+        """Worth by the separation of every ordered pair (true, refitted)."""
+        squares = [np.einsum("naa->na", refitted.left(*design)) for refitted in designs]
+        return worth(np.sqrt(np.maximum(np.stack(squares, axis=2), 0.0)))
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
-        best_first = places[np.argsort(-worth_of([], places, limits.trials))]
+        best_first = places[np.argsort(-worth_of((), places, limits.trials))]
         # 2: new vines that are tried, at most (chosen)
-        return list(dict.fromkeys(conditions[k].trial.vine for k in best_first))[: 2 if len(terms) == 2 else 1]
+        return list(dict.fromkeys(conditions[k].trial.vine for k in best_first))[: 2 if len(tied) == 2 else 1]
 
-    options: list[tuple[list[int], Floats]] = []
+    options: list[tuple[list[Condition], Floats]] = []
     before = -math.inf
     for _, allowed in conditions_by_effort(conditions, best_vines):
-        values = worth_of([], allowed, limits.trials)
-        start = [int(allowed[int(np.argmax(values))])] * limits.trials
-        design, predicted = exchanged(start, float(np.max(values)), allowed, partial(worth_of, places=allowed))
+        start = [int(allowed[int(np.argmax(worth_of((), allowed, limits.trials)))])] * limits.trials
+        design = sorted(exchanged(start, allowed, worth_of))
+        predicted = float(worth_of(design)[0])
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
-            before = predicted
-            options.append((sorted(design), simulated_rises(terms, sorted(design), [0], seed)))
+            before, trials = predicted, [conditions[k] for k in design]
+            options.append((trials, simulated_rises(tied, trials, [0], seed)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
             if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
@@ -181,10 +249,11 @@ def _best_option(terms: list[Hypothesis], limits: Limits, seed: int) -> tuple[li
     return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
 
 
-def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Floats, seed: int) -> NextExperiment:
+def _recommendation(
+    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats, seed: int
+) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    fits, names = [one.fit for one in terms], [one.name for one in terms]
-    between = _separations(np.concatenate([rises, simulated_rises(terms, design, [1], seed)]))
+    between = _separations(np.concatenate([rises, simulated_rises(fits, design, [1], seed)]))
     expected = _by_pair(between)
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
@@ -193,7 +262,9 @@ def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Float
     kinds = [{effect.kind for effect in fit.model} for fit in fits]
     to_measure = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
     measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in to_measure])
-    trials = trial_entries(terms[0].conditions, design)
+    counts = Counter(condition.trial.name for condition in design)
+    once = {condition.trial.name: condition for condition in design}
+    trials = tuple({**_entry(condition), "replicates": counts[name]} for name, condition in once.items())
     if_true = {title[a, b]: {names[a]: float(between[a, b]), names[b]: float(between[b, a])} for a, b in title}
     told = {"trials": trials, "least_sigma": least_separation, "if_true": if_true}
     more = {"unresolved": [title[pair] for pair in unresolved], "measurement": measurement}
@@ -204,12 +275,6 @@ def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Float
         if_true_sigma=if_true,
         measurement=measurement,
     )
-
-
-def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """Return the trials of a design as entries of `next_experiment`, one for each condition."""
-    counted = zip(*np.unique(np.array(design), return_counts=True), strict=True)
-    return tuple({**_entry(every[index]), "replicates": int(replicates)} for index, replicates in counted)
 
 
 def _entry(condition: Condition, *more: str) -> dict[str, Any]:
@@ -224,206 +289,128 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------
-# Information of candidate designs about the sizes of effects, by linear theory.
-#
-# With trial effects eliminated, the cross products of free parameters, shared systematic errors and the shape of the
-# effect add up over trials. Of a design with n_c trials of condition c, and the trials so far,
-#
-#     M = M_prior + M_so_far + Σ_c n_c M_c,   I = M_aa − M_aν M_νν⁻¹ M_νa
-#
-# is the information about the size a with all other unknowns ν free. One trial of every condition is therefore
-# simulated once, and designs are evaluated by linear algebra.
+# The fewest trials that give an effect of some size a target power, by its information in candidate designs.
 
 REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
-UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
-
-
-class DesignInformation:
-    """Information of designs about the size of an effect with everything else free. `conditions` are those that can be
-    filmed; `each`, shape (n_conditions, n, n), is what `REPLICATES` trials of each add, the effect last.
-    """
-
-    def __init__(self, design: CampaignDesign, every: Sequence[Condition], effect: str) -> None:
-        tests = tests_with_conditions(design, every, (effect,))
-        fit, products, problem = tests.fit, tests.products, tests.products.problem
-        # Unknowns of the fit, then the size of the effect; not the residual and other shapes
-        size = problem.prior_mean.size + 1
-        residual_and_shapes = np.full(1 + products.n_shapes, -1)
-        residual_and_shapes[1 + typical_shapes(tests, effect)[-1]] = size - 1
-        index = np.concatenate([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))], axis=1)
-        of_trials = at_unknowns(products_without_trial_effects(products, fit.state), index, size)
-        # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
-        # (chosen); the size of the effect has none.
-        prior = np.append(np.maximum(problem.prior_precision, 1e-6), 0.0)
-        # 12: frames of growth below which a trial is not worth filming (chosen)
-        before = {trial.name for trial in design.trials}
-        places = {trial.name: k for k, trial in enumerate(fit.trials)}
-        moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in fit.predictor.data]
-        filmed = {name: k for name, k in places.items() if name not in before and moving[k] >= 12}
-        self.conditions = tuple(condition for condition in every if condition.trial.name in filmed)
-        self.each = REPLICATES * of_trials[[filmed[condition.trial.name] for condition in self.conditions]]
-        done = [k for name, k in places.items() if name in before]
-        self.so_far = np.diag(prior) + of_trials[done].sum(axis=0)
-
-    def total(self, chosen: Sequence[int]) -> Floats:
-        """Cross products of the trials so far and of a design. Shape (n, n)."""
-        return np.asarray(self.so_far + self.each[list(chosen)].sum(axis=0))
-
-    def of(self, totals: Floats) -> Floats:
-        """Information about the size with all other unknowns free. Shapes: totals (n_designs, n, n) → (n_designs,)."""
-        cross = totals[:, :-1, -1:]
-        solved = np.linalg.solve(totals[:, :-1, :-1], cross)
-        information = totals[:, -1:, -1:] - np.swapaxes(cross, 1, 2) @ solved
-        return np.asarray(np.maximum(information[:, 0, 0], 0.0))
-
-    def of_design(self, chosen: Sequence[int]) -> float:
-        """Information from these trials and those so far."""
-        return float(self.of(self.total(chosen)[None])[0])
-
-    def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
-        """The fewest pairs that reach the wanted information, else the best `most`; and how many
-        trials by effort.
-        """
-
-        def cost(chosen: Sequence[int]) -> tuple[float, float]:
-            information = self.of_design(chosen)
-            return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
-
-        def best_vines(places: NDArray[np.intp]) -> list[str]:
-            """The new vines with the largest information in unlimited trials of all their conditions."""
-            vines = np.array([condition.trial.vine for condition in self.conditions])
-            new = list(dict.fromkeys(vines[places].tolist()))
-            unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[vines == vine].sum(axis=0) for vine in new]
-            # 2: new vines that are tried, one at a time (chosen)
-            return [new[k] for k in np.argsort(-self.of(np.stack(unlimited)))[:2]]
-
-        options: dict[str, list[int]] = {}
-        effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-        for effort, allowed in conditions_by_effort(self.conditions, best_vines):
-            words, chosen = effort_words[effort], self._smallest(allowed, wanted, most)
-            options[words] = min(options.get(words, chosen), chosen, key=cost)
-        reached = {words: REPLICATES * len(chosen) for words, chosen in options.items() if cost(chosen)[0] < math.inf}
-        return min(options.values(), key=cost, default=[]), reached
-
-    def _smallest(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
-        """Pairs added one by one up to the wanted information, exchanged, and as many as are needed of these, the most
-        informative first.
-        """
-        chosen: list[int] = []
-        now = self.of_design(chosen)
-        while now < wanted and len(chosen) < most:
-            values = self.of(self.total(chosen) + self.each[allowed])
-            if not np.max(values) > now:
-                break
-            chosen.append(int(allowed[int(np.argmax(values))]))
-            now = float(np.max(values))
-        chosen, _ = exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))
-        order: list[int] = []
-        while chosen and (not order or self.of_design(order) < wanted):
-            gains_of = self.of(self.total(order) + self.each[chosen])
-            order.append(chosen.pop(int(np.argmax(gains_of))))
-        return order
-
-
-def tests_with_conditions(
-    design: CampaignDesign, added: Sequence[Condition], candidates: Sequence[str] | None
-) -> MisfitTests:
-    """Misfit tests of a noise-free design with one trial of each condition added."""
-    longest_s = max(camera.longest_s for camera in design.cameras)
-    column = design.model.parameter_names.index(DAMPING)
-    B = {trial.vine: float(design.model.parameters_of(trial)[column]) for trial in design.trials}
-    for condition in added:
-        like = design.trials[condition.like]
-        B.setdefault(condition.trial.vine, B[like.vine] * prior_ratio(condition.trial, like))
-    cameras = [replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added]
-    extended = replace(
-        design,
-        model=design.model.with_values({DAMPING: B}),
-        trials=(*design.trials, *(condition.trial for condition in added)),
-        cameras=(*design.cameras, *cameras),
-        candidates=candidates,
-    )
-    return planned_tests(extended)[0]
-
-
-def tests_of_designs(
-    design: CampaignDesign, conditions: Sequence[Condition]
-) -> Callable[[Sequence[Condition]], MisfitTests]:
-    """Return a function that gives the misfit tests of the trials so far and trials of these conditions, of which one
-    each is simulated.
-    """
-    unique = list({condition.trial.name: condition for condition in conditions}.values())
-    tests = tests_with_conditions(design, unique, design.candidates)
-    fit, solution = tests.fit, tests.fit.solution
-    place_of = {trial.name: k for k, trial in enumerate(fit.trials)}
-    so_far = [place_of[trial.name] for trial in design.trials if trial.name in place_of]
-
-    def with_trials(added: Sequence[Condition]) -> MisfitTests:
-        places = [*so_far, *(place_of[condition.trial.name] for condition in added)]
-        rows = np.array(places)
-        predictor, problem, (state,) = subset(
-            fit.predictor, solution.problem, rows, solution.state, every_parameter=True
-        )
-        columns = tuple(solution.columns[k] for k in places)
-        part = replace(
-            solution, state=state, problem=problem, cross_products=solution.cross_products[rows], columns=columns
-        )
-        trials = tuple(fit.trials[k] for k in places)
-        of_part = replace(fit, predictor=predictor, solution=part, trials=trials, smooth=None)
-        products = tests.products.of(places)
-        sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
-        scores = scores_of(of_part, products)
-        return replace(tests, fit=of_part, products=products, sensitivities=sensitivities, scores=scores)
-
-    return with_trials
+UNLIMITED = 1000  # Pairs of trials of each condition that stand for unlimited replicates (chosen)
 
 
 def further_trials(
-    design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
+    tests: MisfitTests, now: EffectPower, value: float, target: float, limits: Limits | None = None
 ) -> FurtherTrials:
-    """Find the fewest further trials that give an effect of some size a target power."""
-    limits = limits or Limits()
+    """Find the fewest further trials that give an effect of some size a target power; `tests` are of those so far."""
+    limits, trials = limits or Limits(), [trial.trial for trial in tests.fit.trials]
     # 48: most further trials considered where `limits.trials` is not stated (chosen)
     most = (limits.trials if "trials" in limits.model_fields_set else 48) // REPLICATES
     before = now.probability_at(value)
-    plan = FurtherTrials(now, value, target, before)
-    feasible = feasible_conditions(design.trials, limits)
-    if before >= target or not feasible:
-        return replace(plan, unlimited=before)
-    search = DesignInformation(design, feasible, now.effect)
+    plan = FurtherTrials(now, value, target, before, before)
+    if before >= target:
+        return plan
+    fit = replace(tests.fit, solution=replace(tests.fit.solution, state=tests.fit.state), smooth=None)
+    films = filmed([fit], feasible_conditions(trials, limits))
+    if not films:
+        return plan
+    (effect,) = (effect for effect in tests.effects if effect.name == now.effect)
+    of_effect = misfit_tests(extended_fit(fit, films), [effect], tests.level)
+    designs = Designs(of_effect.fit, of_effect.products, len(trials), typical_shapes(of_effect, effect.name)[-1:])
+
+    def information(design: Sequence[int], added: NDArray[np.intp] | None = None, times: float = 1.0) -> Floats:
+        return np.maximum(designs.left(design, added, REPLICATES * times)[:, 0, 0], 0.0)
+
     deviation = abs(value - now.zero)
-    wanted = search.of_design(()) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
+    wanted = float(information(())[0]) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
     if not math.isfinite(wanted):
         # 4.7: score that a size needs where the trials so far have no information about it (derived)
         wanted = (4.7 / deviation) ** 2
+    conditions = [condition for condition, _ in films]
     # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
     for _ in range(3):
-        chosen, needed = search.fewest(wanted, most)
-        plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
-        shortfall = abs(plan.power.size_at(target) - now.zero) / deviation
+        chosen, needed = _fewest(conditions, information, wanted, most)
+        made, power = _made(replace(tests, fit=fit), [films[k] for k in chosen], plan)
+        plan = replace(plan, trials=made, power=power, n_conditions=len(films), needed=needed)
+        shortfall = abs(power.size_at(target) - now.zero) / deviation
         if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most:
             break
-        wanted = 1.02 * search.of_design(chosen) * shortfall**2
-    return plan
+        wanted = 1.02 * float(information(chosen)[0]) * shortfall**2
+    endless, known = information(range(len(films)), times=UNLIMITED), information(chosen[: len(made) // REPLICATES])
+    ratio = math.sqrt(endless[0] / max(known[0], 1e-300))
+    unlimited = plan.power.probability_at(plan.power.zero + ratio * (value - plan.power.zero))
+    return replace(plan, unlimited=max(unlimited, plan.after))
 
 
-def _evaluated(
-    design: CampaignDesign, search: DesignInformation, plan: FurtherTrials, chosen: Sequence[int]
-) -> FurtherTrials:
-    """The plan with as many of these trials as needed, and the power after each."""
-    conditions = [search.conditions[k] for k in chosen for _ in range(REPLICATES)]
-    tests_with = tests_of_designs(design, conditions)
-    trials: list[dict[str, Any]] = []
-    power, probability = plan.power, plan.before
-    while len(trials) < len(conditions) and probability < plan.target:
-        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), power.effect) or power
+def _fewest(
+    conditions: Sequence[Condition], information: Criterion, wanted: float, most: int
+) -> tuple[list[int], dict[str, int]]:
+    """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
+
+    def cost(chosen: Sequence[int]) -> tuple[float, float]:
+        known = float(information(chosen)[0])
+        return (len(chosen), 0.0) if known >= wanted else (math.inf, -known)
+
+    def best_vines(places: NDArray[np.intp]) -> list[str]:
+        """The new vines with the largest information in unlimited trials of all their conditions."""
+        vines = np.array([condition.trial.vine for condition in conditions])
+        known = {vine: information(np.flatnonzero(vines == vine), times=UNLIMITED)[0] for vine in vines[places]}
+        # 2: new vines that are tried, one at a time (chosen)
+        return sorted(known, key=lambda vine: -known[vine])[:2]
+
+    options: dict[str, list[int]] = {}
+    effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
+    for effort, allowed in conditions_by_effort(conditions, best_vines):
+        words, chosen = effort_words[effort], _smallest(allowed, information, wanted, most)
+        options[words] = min(options.get(words, chosen), chosen, key=cost)
+    reached = {words: REPLICATES * len(chosen) for words, chosen in options.items() if cost(chosen)[0] < math.inf}
+    return min(options.values(), key=cost, default=[]), reached
+
+
+def _smallest(allowed: NDArray[np.intp], information: Criterion, wanted: float, most: int) -> list[int]:
+    """Pairs added one by one up to the wanted information, exchanged, and as many as are needed of these, the most
+    informative first.
+    """
+    chosen: list[int] = []
+    now = float(information(chosen)[0])
+    while now < wanted and len(chosen) < most:
+        values = information(chosen, allowed)
+        if not np.max(values) > now:
+            break
+        chosen.append(int(allowed[int(np.argmax(values))]))
+        now = float(np.max(values))
+    chosen = exchanged(chosen, allowed, information)
+    order: list[int] = []
+    while chosen and (not order or information(order)[0] < wanted):
+        order.append(chosen.pop(int(np.argmax(information(order, np.array(chosen))))))
+    return order
+
+
+def _made(
+    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], plan: FurtherTrials
+) -> tuple[tuple[dict[str, Any], ...], EffectPower]:
+    """Pairs of these trials, as many as needed, with the probability after each; and the power with them."""
+    before, power, probability = len(tests.fit.trials), plan.power, plan.before
+    different = list({condition.trial.name: (condition, film) for condition, film in films}.values())
+    with_all = misfit_tests(extended_fit(tests.fit, different), tests.effects, tests.level)
+    places = {trial.name: k for k, trial in enumerate(with_all.fit.trials)}
+    rows, trials = list(range(before)), []
+    for condition, _ in films:
+        if probability >= plan.target:
+            break
+        rows += [places[condition.trial.name]] * REPLICATES
+        power = effect_power(_of_trials(with_all, rows), power.effect) or power
         probability = power.probability_at(plan.value)
-        for condition in conditions[len(trials) : len(trials) + REPLICATES]:
-            cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
-            known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
-            trials.append({**known, "probability": probability})
-    endless = search.of((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
-    ratio = math.sqrt(endless / max(search.of_design(chosen[: len(trials) // REPLICATES]), 1e-300))
-    unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))
-    return replace(plan, trials=tuple(trials), power=power, unlimited=max(unlimited, probability))
+        cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
+        known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
+        trials += [{**known, "probability": probability}] * REPLICATES
+    return tuple(trials), power
+
+
+def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
+    """The tests of some of the trials, which may be repeated, at the same parameters."""
+    fit, rows = tests.fit, np.array(places)
+    solution = fit.solution
+    predictor, problem, (state,) = subset(fit.predictor, solution.problem, rows, solution.state, every_parameter=True)
+    columns, cross_products = tuple(solution.columns[k] for k in places), solution.cross_products[rows]
+    solution = replace(solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
+    part, products = at_solution(fit, predictor, solution), tests.products.of(places)
+    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
+    return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))

@@ -45,7 +45,8 @@ from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, systematics_of
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
+from vinetrack.planning.candidate_trials import at_solution
 
 # ------------------------------------------------------------------------------
 # Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
@@ -138,20 +139,7 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
     how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2, "columns": initial}
     solution = solve(predictor, start.solution.problem, state, held, warm=True, **how)
-    trials = [
-        replace(
-            trial,
-            time_s=trial_data.time_s,
-            lead_position_m=trial_data.lead_position_m,
-            predicted_position_m=trial_data.lead_position_m - columns[:, -1],
-            predicted_velocity_m_s=-columns[:, RELEASE],
-            origin_m=float(origin_m),
-        )
-        for trial, trial_data, columns, origin_m in zip(
-            start.trials, data, solution.columns, solution.state.trial_effects[:, ORIGIN], strict=True
-        )
-    ]
-    return replace(start, predictor=predictor, solution=solution, trials=tuple(trials))
+    return at_solution(start, predictor, solution)
 
 
 def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:

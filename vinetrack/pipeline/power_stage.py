@@ -30,6 +30,7 @@ from vinetrack.diagnosis.campaign_power import (
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
@@ -88,7 +89,8 @@ class PowerRequest:
         return (sigma_m, correlation), (of_P, of_B), inputs
 
 
-Campaign = tuple[Power, CampaignDesign, Limits]  # Power by linear theory, design, and constraints on further trials
+# Power by linear theory, the tests that it is of, how to simulate such campaigns, and constraints on further trials
+Campaign = tuple[Power, MisfitTests, CampaignDesign, Limits]
 
 
 def _campaign_of_target(request: PowerRequest) -> Campaign:
@@ -128,8 +130,9 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
     else:
         inputs = []
-    power = power_of(*fitted_tests(fitted, candidates), inputs, nonlinear=True)
-    return power, design_of_fit(fitted, candidates), limits
+    tests, not_testable = fitted_tests(fitted, candidates)
+    power = power_of(tests, not_testable, inputs, nonlinear=True)
+    return power, tests, design_of_fit(fitted, candidates), limits
 
 
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
@@ -164,7 +167,8 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
     design = CampaignDesign(model, tuple(trials), tuple(cameras), spreads, settings.candidates)
-    return power_of(*planned_tests(design), inputs, nonlinear=True), design, settings.limits
+    tests, not_testable = planned_tests(design)
+    return power_of(tests, not_testable, inputs, nonlinear=True), tests, design, settings.limits
 
 
 def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
@@ -183,11 +187,13 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
-            now, design, limits = _campaign_of_target(request)
+            now, tests, design, limits = _campaign_of_target(request)
         elif isinstance(given, Fit):
-            now, design, limits = power_of(*fitted_tests(given), nonlinear=True), design_of_fit(given), Limits()
+            tests, not_testable = fitted_tests(given)
+            now, design, limits = power_of(tests, not_testable, nonlinear=True), design_of_fit(given), Limits()
         else:
-            now, design, limits = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+            base = make_model(BASE_EFFECTS)
+            now, tests, design, limits = _measured_campaign(request, base, list(given), None, Limits())
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, design, now, asked)))
@@ -199,7 +205,7 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
             if not math.isfinite(value):
                 raise refusal("--effect", text, "needs a size", "write the size to detect, such as leak=0.5")
             with waiting(f"searching for trials that detect {name}"):
-                plan = further_trials(design, power[name], value, request.reach, limits)
+                plan = further_trials(tests, power[name], value, request.reach, limits)
             power = replace(power, further=(*power.further, plan))
     return power.of_effects([name for name, _ in asked])
 

@@ -1,0 +1,485 @@
+"""Candidate trials: those that could be made next, and a fit extended by them as if they had been filmed.
+
+Every condition within the limits of the user is filmed once, without noise, as a fit predicts it. `extended` adds such
+trials to the fit: its parameters stay as they are, and every new vine adds its own. What a design would tell, which is
+all trials so far and some of these, is then a sum over trials (`vinetrack.diagnosis.further_trials`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
+from vinetrack.dynamics.simulate import SimulationError, Trajectory
+from vinetrack.experiment.schema import COLUMNS, RIG, with_names
+from vinetrack.experiment.settings import Limits
+from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, FitState, MixedProblem
+from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
+from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.sensitivity import (
+    N_TRIAL_EFFECTS,
+    ORIGIN,
+    RELEASE,
+    Jobs,
+    Predictor,
+    initial_trial_effects,
+)
+from vinetrack.inference.solving import trial_fit
+from vinetrack.planning.predictive_inputs import hoop_stress_Pa, prior_ratio
+from vinetrack.tracks.position_noise import ar1_noise
+
+# ------------------------------------------------------------------------------
+# Candidate trials for the next experiment: pressures, payloads, vines and rigs within the user's limits.
+#
+# Where a limit is not given it follows from the experiment: pressures from the lowest used to a quarter above the
+# highest and never above the strength of the film; no payload or the heaviest used; half and twice the chamber;
+# connectors of half and twice the area; and vines of other diameters and film thicknesses. Only one part of a rig
+# changes at a time.
+
+SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
+
+SIZES = ("diameter_mm", "thickness_um", "length_mm")  # Columns by which vines differ (defined)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A trial that could be made. `like` is the index, among the trials of the experiment, of the trial it is modelled
+    on: for an existing vine a trial with it, else one with the vine nearest in size.
+    """
+
+    trial: Trial
+    like: int
+    effort: int
+    changed: tuple[str, ...] = ()
+
+
+def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
+    """Every candidate trial; empty where the limits exclude all."""
+    used = [trial for trial in trials if trial.travel_ratio != 1]
+    first = {trial.vine: k for k, trial in reversed(list(enumerate(trials))) if trial.travel_ratio != 1}
+    models = [(trials[k], k) for k in sorted(first.values())]
+    stated = {column: values for column in SIZES if (values := _stated(limits, column)) is not None}
+    vines = [
+        (trial, k, SAME_RIG)
+        for trial, k in models
+        if all(_is_among(_of(trial, column), [*values, math.nan]) for column, values in stated.items())
+    ]
+    if limits.new_vines:
+        vines += [(vine, like, NEW_VINE) for vine, like in _new_vines(models, limits)]
+    conditions: list[Condition] = []
+    for vine, like, effort_of_vine in vines:
+        rigs = _rigs(vine, used, limits)
+        least = min((effort for effort, _ in rigs), default=SAME_RIG)
+        for effort, rig in rigs:
+            if effort_of_vine == NEW_VINE and effort > least:
+                continue
+            for payload in _payloads(used, limits):
+                for pressure, sigma in _pressures(rig, payload, used, limits):
+                    settings: dict[str, Any] = {"pressure_Pa": pressure, "pressure_sigma_Pa": sigma}
+                    name = f"next_{len(conditions) + 1}"
+                    trial = replace(rig, name=name, payload_kg=payload, **settings)
+                    changed = _changed(trial, trials[like])
+                    conditions.append(Condition(trial, like, max(effort, effort_of_vine), changed))
+    return conditions
+
+
+def conditions_by_effort(
+    conditions: Sequence[Condition], best_new_vines: Callable[[NDArray[np.intp]], Sequence[str]]
+) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield the indices of the conditions to choose from with more and more effort: on the rig so far, with another
+    rig as well, and with one new vine at a time as well, of those that `best_new_vines` chooses among their indices.
+    """
+    efforts = np.array([condition.effort for condition in conditions])
+    for effort in (SAME_RIG, OTHER_RIG):
+        if (efforts == effort).any():
+            yield effort, np.flatnonzero(efforts <= effort)
+    new = np.flatnonzero(efforts == NEW_VINE)
+    for vine in best_new_vines(new) if new.size else ():
+        vines = np.array([condition.trial.vine for condition in conditions])
+        yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
+
+
+def _of(trial: Trial, column: str) -> float:
+    """The value of a column, SI."""
+    value: float = getattr(trial, COLUMNS[column].field)
+    return value
+
+
+def _stated(limits: Limits, column: str) -> list[float] | None:
+    """Values of a column that the user allows, SI; None for any."""
+    values = getattr(limits, column)
+    return None if values is None else [COLUMNS[column].to_si(value) for value in values]
+
+
+def _is_among(value: float, values: Iterable[float]) -> bool:
+    """Whether a value is one of these; a blank one is one of blank ones."""
+    return any(
+        math.isclose(value, listed, rel_tol=1e-4, abs_tol=1e-12) or (math.isnan(value) and math.isnan(listed))
+        for listed in values
+    )
+
+
+def _changed(trial: Trial, before: Trial, columns: Iterable[str] = RIG) -> tuple[str, ...]:
+    """The columns in which two trials differ."""
+    return tuple(column for column in columns if not _is_among(_of(trial, column), [_of(before, column)]))
+
+
+def _choices(
+    limits: Limits, column: str, factors: Sequence[float], now: Sequence[float], others: Sequence[float] = ()
+) -> list[float]:
+    """Values of a column to choose from, SI: the user's; else those of now, others, and multiples of the smallest and
+    largest of now to two significant digits, as a person would order them. A part that is not there stays so.
+    """
+    now, stated = [value for value in now if math.isfinite(value)], _stated(limits, column)
+    if not now or stated is not None:
+        return stated if stated and now else [math.nan]
+    multiples = [float(f"{f * (min(now) if f < 1 else max(now)):.2g}") for f in factors]
+    values = [*now, *filter(math.isfinite, others), *multiples]
+    return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
+
+
+def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
+    """The vine on every rig; chamber, connector and angle change one at a time unless the limits require more."""
+    factors_of = {"chamber_l": (0.5, 2.0), "inlet_mm": (math.sqrt(0.5), math.sqrt(2.0)), "growth_angle_deg": ()}
+    choices = [
+        _choices(limits, column, factors, [_of(vine, column)], [_of(trial, column) for trial in used])
+        for column, factors in factors_of.items()
+    ]
+    rigs: list[tuple[int, int, Trial]] = []
+    for parts in itertools.product(*choices):
+        changed: dict[str, Any] = {COLUMNS[column].field: part for column, part in zip(factors_of, parts, strict=True)}
+        rig = replace(vine, **changed)
+        changes = len(_changed(rig, vine))
+        if changes == 0 or not rig.inlet_m > vine.diameter_m:
+            at_hand = any(not _changed(rig, trial) for trial in used)
+            rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
+    fewest = min((changes for changes, _, _ in rigs), default=0)
+    return [(effort, rig) for changes, effort, rig in rigs if changes <= max(1, fewest)]
+
+
+def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
+    """No payload (or the lightest allowed), the heaviest, and those used in between."""
+    payloads = {trial.payload_kg for trial in used}
+    heaviest = max(payloads) if max(payloads) > 0 else 0.05  # kg, where none was used yet
+    low, high = _stated(limits, "payload_g") or (0.0, heaviest)
+    return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
+
+
+def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
+    """Set pressures in equal ratios, Pa, each with its standard error."""
+    pressure_step_pa = 100.0  # Resolution of set pressures, Pa (chosen)
+    pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
+    if not pressures:
+        return []
+    # 1.25: a quarter above the highest used
+    low, high = _stated(limits, "pressure_kPa") or (min(pressures), 1.25 * max(pressures))
+    stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
+    if math.isfinite(stress_Pa):
+        # The default strength of film must not exclude pressures that this vine has held; a stated strength may.
+        is_stated = "hoop_stress_MPa" in limits.model_fields_set
+        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not is_stated]
+        bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
+        high = min(high, max([pressure_step_pa * math.floor(bursts_Pa / pressure_step_pa), *held]))
+    if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
+        # 1.15: lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
+        low = max(low, 1.15 * rig.yield_pressure_Pa)
+    if not low <= high:
+        return []
+    # 6: candidate pressures of a vine (chosen)
+    steps = np.geomspace(low, high, 6) if high > 1.02 * low else np.array([high])
+    relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
+    share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
+    steps = np.clip(pressure_step_pa * np.round(steps / pressure_step_pa), low, high)
+    return [(float(pressure), share * float(pressure)) for pressure in np.unique(steps.round(3))]
+
+
+def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:
+    """Vines that could be made, each with the index of the trial whose vine is nearest in size."""
+    vines = [trial for trial, _ in models]
+    diameters, walls = (
+        sorted(_choices(limits, column, factors, [_of(vine, column) for vine in vines]))
+        for column, factors in (("diameter_mm", (0.5, 0.75, 1.5)), ("thickness_um", (0.5, 2.0)))
+    )
+    new_vines: list[tuple[Trial, int]] = []
+    for diameter, wall in itertools.product(diameters, walls):
+        column = COLUMNS["diameter_mm"]
+        if not wall <= diameter / 4 or not column.low <= 1e3 * diameter <= column.high:
+            continue
+        distances = [math.hypot(math.log(v.diameter_m / diameter), math.log(v.thickness_m / wall)) for v in vines]
+        near, like = models[int(np.argmin(distances))]
+        for length in _stated(limits, "length_mm") or [near.length_m]:
+            size: dict[str, Any] = {"diameter_m": diameter, "thickness_m": wall, "length_m": length}
+            sized = replace(near, video=None, track=None, pressure_trace=None, **size)
+            if all(_changed(sized, vine, SIZES) for vine in vines):
+                new_vines.append((with_names([sized])[0], like))
+    most = 10  # New vines considered, at most (chosen)
+    if len(new_vines) <= most:
+        return new_vines
+    return [new_vines[k] for k in np.linspace(0, len(new_vines) - 1, most).round().astype(int)]
+
+
+# ------------------------------------------------------------------------------
+# A fit extended by trials that it was not fitted to, as if they had been filmed.
+
+
+def extended(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> tuple[Predictor, MixedProblem, FitState]:
+    """Predictor, problem and state of a fit with further trials, its parameters as they are. A new vine adds its own: B
+    of the vine nearest in size, scaled by the ratio of their priors, and the yield pressure with the error to which it
+    will be measured.
+    """
+    old, state, data, names = fit.predictor.layout, fit.solution.state, fit.predictor.data, fit.model.parameter_names
+    further = [film for _, film in films]
+    fitted_rows, _ = old.rows(state.theta)
+    free, index, base = list(old.free), list(old.index), list(old.base)
+    places: dict[tuple[str, str], int] = {}
+    for condition, film in films:
+        trial, like = film.trial, data[condition.like].trial
+        row, values = old.index[condition.like].copy(), np.array(fitted_rows[condition.like])
+        is_new = trial.vine != like.vine
+        if is_new and fit.predictor.damping_column >= 0:
+            values[fit.predictor.damping_column] *= prior_ratio(trial, like)
+        for column, key in enumerate(old.keys):
+            if is_new and row[column] >= 0 and (of_like := old.free[row[column]]).vine:
+                if (key, trial.vine) not in places:
+                    places[key, trial.vine] = len(free)
+                    start = trial.yield_pressure_Pa if key == YIELD_PRESSURE else of_like.start
+                    if key in names:
+                        start = float(np.clip(values[names.index(key)], of_like.lower, of_like.upper))
+                    free.append(replace(of_like, vine=trial.vine, start=start))
+                row[column] = places[key, trial.vine]
+        index.append(row)
+        base.append(values)
+    layout = ParameterMap(old.model, tuple(free), old.keys, np.array(index), np.array(base))
+    predictor = Predictor(layout, [*data, *further], fit.predictor.host)
+    predictor.steps = fit.predictor.steps.copy()
+    typical = np.exp(np.mean(np.log(state.variance)))
+    state = replace(
+        state,
+        theta=np.append(state.theta, layout.start[state.theta.size :]),
+        trial_effects=np.concatenate([state.trial_effects, initial_trial_effects(further)]),
+        variance=np.append(state.variance, np.full(len(films), typical)),
+    )
+    problem = make_problem(predictor, state.trial_effects)
+    problem.release_origin_mean[: len(data)] = fit.solution.problem.release_origin_mean
+    return predictor, problem, state
+
+
+def extended_fit(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> Fit:
+    """The fit with further trials, linearised at its parameters and not refitted."""
+    predictor, problem, state = extended(fit, films)
+    columns = tuple(predictor.linearise(state.theta, state.trial_effects))
+    cross_products = predictor.products(columns)
+    known = replace(fit.solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
+    return at_solution(fit, predictor, known)
+
+
+def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
+    """The fit with other data and state; its numbers and errors are not computed anew."""
+    state = solution.state
+    trials = [
+        trial_fit(
+            trial_data,
+            effects,
+            np.zeros(N_TRIAL_EFFECTS),
+            trial_data.lead_position_m - effects[ORIGIN] - columns[:, -1],
+            -columns[:, RELEASE],
+            state.rho,
+            float(variance),
+        )
+        for trial_data, effects, columns, variance in zip(
+            predictor.data, state.trial_effects, solution.columns, state.variance, strict=True
+        )
+    ]
+    return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), smooth=None)
+
+
+# ------------------------------------------------------------------------------
+# Films of candidate trials, sampled as the camera of the experiment would.
+
+
+def _blank(fit: Fit, condition: Condition, time_s: Floats) -> FitTrial:
+    """A trial of a condition at these times; its positions are placeholders, and a recorded pressure is constant."""
+    trial, like = condition.trial, fit.predictor.data[condition.like]
+    constant = (np.array([-1e3, 1e3]), np.full(2, trial.pressure_Pa))
+    return FitTrial(
+        trial=trial,
+        time_s=time_s,
+        lead_position_m=time_s,
+        first=np.arange(time_s.size) == 0,
+        n_rest=int(np.count_nonzero(time_s <= 0)),
+        noise_m=like.noise_m,
+        correlation=like.correlation,
+        trace=None if like.trace is None else constant,
+        position_systematic_m=like.position_systematic_m,
+        slow_m=None if like.slow_m is None else np.full(time_s.size, np.median(like.slow_m)),
+    )
+
+
+def _filming(fit: Fit) -> tuple[int, float]:
+    """Frames at rest before release, and the longest motion that is filmed, s: longer than any so far."""
+    data = [trial_data for trial_data in fit.predictor.data if trial_data.trial.travel_ratio != 1]
+    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in data]
+    return max(int(np.median([trial_data.n_rest for trial_data in data])), 3), 1.5 * float(max(moving_s))
+
+
+def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> tuple[Jobs, list[Trajectory | None]]:
+    """Jobs and trajectories of trials as the fit predicts them, see `_simulated`."""
+    predictor, _, state = extended(fit, blanks)
+    state.trial_effects[len(fit.trials) :, ORIGIN] = 0.0
+    jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
+    return jobs, _simulated(predictor, jobs)
+
+
+def _simulated(predictor: Predictor, jobs: Jobs) -> list[Trajectory | None]:
+    """Trajectories of all jobs; None for those that cannot be simulated, found by bisection."""
+    try:
+        return list(predictor.run(jobs))
+    except SimulationError:
+        if len(jobs) == 1:
+            return [None]
+    middle = len(jobs) // 2
+    return _simulated(predictor, jobs[:middle]) + _simulated(predictor, jobs[middle:])
+
+
+def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[Condition, FitTrial]]:
+    """One trial of every condition without noise, as the first fit predicts it, until the first of all predictions
+    nears the end of the growth. Conditions that are not worth filming, or for which the last model is in doubt, are
+    left out.
+    """
+    fit, (rest_frames, longest_s) = fits[-1], _filming(fits[-1])
+    grid_s = np.linspace(0.0, longest_s, 400)
+    runs = [_courses(each, [(one, _blank(fit, one, grid_s)) for one in conditions]) for each in fits]
+    # The largest ratio of tail speed to steady speed among the trials so far
+    made = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
+    seen = [
+        _speed_ratio(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
+        for trial_fit, job in zip(fit.trials, made, strict=True)
+        if trial_fit.trial.travel_ratio != 1
+    ]
+    # 1.05: the ratio above which the model predicts compression in the tail (chosen)
+    largest_ratio = max(1.05, *filter(math.isfinite, seen))
+    films = []
+    for condition, job, *moved in zip(conditions, runs[-1][0], *(run for _, run in runs), strict=True):
+        trial, moving = condition.trial, [course for course in moved if course is not None]
+        if len(moving) < len(fits):
+            continue
+        near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
+        near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in moving)
+        grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
+        ratio, frame_s = _speed_ratio(fit, trial, job, moving[-1].tail_velocity_m_s), _frame_s(fit, condition)
+        # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
+        grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * frame_s
+        if grows_enough and (trial.tail_slack == "free" or ratio <= largest_ratio):
+            films.append((condition, _blank(fit, condition, frame_s * np.arange(1 - rest_frames, near_s / frame_s))))
+    _, moved = _courses(fits[0], films) if films else (None, [])
+    return [
+        (condition, replace(film, lead_position_m=course.observed_position_m))
+        for (condition, film), course in zip(films, moved, strict=True)
+        if course is not None
+    ]
+
+
+def _frame_s(fit: Fit, condition: Condition) -> float:
+    """Frame interval of a condition: that of the trial it is modelled on."""
+    return fit.predictor.data[condition.like].frame_s
+
+
+def _speed_ratio(fit: Fit, trial: Trial, job: Jobs, tail_velocity_m_s: Floats) -> float:
+    """Ratio of the largest tail speed to the steady speed without payload; 0 where the model has no damping."""
+    names = fit.model.parameter_names
+    if DAMPING not in names or EXPONENT not in names:
+        return 0.0
+    B, n = (float(job.row[names.index(key)]) for key in (DAMPING, EXPONENT))
+    yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
+    drive_N = (trial.pressure_Pa - yield_Pa) * trial.area_m2
+    if not (drive_N > 0 and B > 0 and n > 0.05):
+        return math.inf if not drive_N > 0 else 0.0
+    return float(np.max(tail_velocity_m_s)) / (drive_N / B) ** (1 / n)
+
+
+# ------------------------------------------------------------------------------
+# What further trials promise, found by simulating them and refitting the hypotheses to old and new trials.
+#
+# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, old
+# and new; between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can
+# explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
+
+
+def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draws: Sequence[int], seed: int) -> Floats:
+    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
+    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
+    average. Shape (n_draws, n, n).
+    """
+    n = len(tied)
+    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    rises = np.full((len(draws), n, n), math.nan)
+    before = np.array([-2 * fit.log_likelihood for fit in tied])
+    for k, a in np.ndindex(len(draws), n):
+        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * tied[a].solution.state.spread
+        try:
+            films = _noisy_films(tied[a], design, deviations, np.random.default_rng([seed, 0, draws[k], a]))
+        except SimulationError:
+            continue
+        if films:
+            after = np.array([_refitted(fit, films) for fit in tied])
+            rises[k, a] = after - before - (after[a] - before[a])
+    return rises
+
+
+def _noisy_films(
+    truth: Fit, design: Sequence[Condition], deviations: Floats, rng: np.random.Generator
+) -> list[tuple[Condition, FitTrial]]:
+    """Trials of a design simulated under a hypothesis, with random release, origin and noise, and prepared as for a
+    fit; without those that have too few points. Shapes: deviations (n_trials, 2).
+    """
+    (rest_frames, longest_s), before = _filming(truth), len(truth.trials)
+    frames_s = [_frame_s(truth, condition) for condition in design]
+    times = [s * np.arange(rest_frames + math.ceil(longest_s / s), dtype=float) for s in frames_s]
+    blanks = [(condition, _blank(truth, condition, time_s)) for condition, time_s in zip(design, times, strict=True)]
+    predictor, _, state = extended(truth, blanks)
+    effects = state.trial_effects[before:]
+    effects[:, RELEASE] = [(rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
+    effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(design))
+    may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])[before:]
+    effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
+    noise_m, films = np.sqrt(state.variance[-1] / (1 - state.rho**2)), []
+    moved = predictor.run(predictor.jobs(state.theta, state.trial_effects)[before:])
+    for (condition, blank), trajectory, of_trial in zip(blanks, moved, effects, strict=True):
+        stop = blank.time_s.size
+        if trajectory.status == "ended":
+            stop = int(np.searchsorted(blank.time_s, of_trial[RELEASE] + trajectory.end_time_s))
+        noise = ar1_noise(stop, noise_m, state.rho, rng)
+        position_m = of_trial[ORIGIN] + trajectory.observed_position_m[:stop] + noise
+        pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
+        with suppress(FitError):
+            track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
+            films.append((condition, prepare_trial(blank.trial, track)))
+    return films
+
+
+def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
+    """−2 ln L of a hypothesis fitted to old and further trials; NaN where the fit fails."""
+    most = 20  # Iterations of a refit, at most (chosen)
+    predictor, problem, state = extended(fit, films)
+    try:
+        # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
+        fixed = FixedTerms(state.spread, (state.rho, state.variance))
+        solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
+        solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
+        # These absorb part of what is wrong in a hypothesis, as in every fit.
+        smooth = smooth_errors(predictor, solution)
+    except SimulationError:
+        return math.nan
+    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
