@@ -29,7 +29,7 @@ from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
 from vinetrack.planning.prediction import drawn_final_speeds
-from vinetrack.planning.predictive_inputs import fit_numbers, predictive_inputs
+from vinetrack.planning.predictive_inputs import FitNumbers, predictive_inputs
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
 SAMPLES = 400
@@ -72,7 +72,7 @@ def measure(seed: int) -> list[dict[str, object]]:
         seed=seed,
     )
     grown = grow(sheet(), nature)
-    numbers = fit_numbers(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown], profile=False))
+    numbers = FitNumbers(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown], profile=False))
     rows = []
     for k, (name, trial) in enumerate(unseen().items()):
         inputs = predictive_inputs(

@@ -121,7 +121,7 @@ def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> guess.FitNumbers:
     covariance = np.array([[0.0036, -0.00048, 0.0], [-0.00048, 1e-4, 0.0], [0.0, 0.0, 1e4]])
     spreads = {"pressure": BetweenTrialSpread(0.02, True), "B": BetweenTrialSpread(0.05, B_is_estimated)}
     rest = {"covariance": covariance, "spreads": spreads, "trials": dict.fromkeys(range(n_trials))}
-    return guess.fit_numbers(FitSummary(vt.base_model().names, numbers=numbers, **rest), "a")
+    return guess.FitNumbers(FitSummary(vt.base_model().names, numbers=numbers, **rest), "a")
 
 
 def test_persons_and_sheets_that_contradict_a_fit_go_before_it_and_the_fit_before_the_guess():

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.inference.fit_result import Fit
-    from vinetrack.planning.prediction import Contribution
+    from vinetrack.planning.predictive_inputs import Band
 
 
 # ------------------------------------------------------------------------------
@@ -671,7 +671,7 @@ def value_in_unit(value: float, unit: str) -> str:
     return "never" if math.isinf(value) else number(value * display_unit(unit, PREDICTION_UNITS)[1])
 
 
-def speed_band_text(share: Contribution) -> str:
+def speed_band_text(share: Band) -> str:
     """Return the 90 % band of the final speed with one uncertain input."""
     return f"{number(share.low)} to {number(share.high)} m/s"
 

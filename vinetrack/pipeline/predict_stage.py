@@ -33,7 +33,6 @@ from vinetrack.planning.prediction import (
     GAMMAS,
     TIME,
     Choice,
-    Quantity,
     Room,
     VinePrediction,
     chambers,
@@ -46,11 +45,10 @@ from vinetrack.planning.prediction import (
     swept_m3,
 )
 from vinetrack.planning.predictive_inputs import (
+    Band,
     FitNumbers,
-    Input,
     PredictiveInputs,
     StatedValues,
-    fit_numbers,
     hoop_stress_Pa,
     predictive_inputs,
     read_sizes,
@@ -111,7 +109,7 @@ def read_basis(
     if results is not None:
         summary, heading = choose_fit(results, anyway)
         with planning_errors():
-            fit = fit_numbers(summary, results.as_posix())
+            fit = FitNumbers(summary, results.as_posix())
     if sheet is None:
         planned = planned_trial(cells, ExperimentSettings(), needed)
     else:
@@ -206,10 +204,10 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
     yield ""
     rows = []
     for one in inputs.bands():
-        if one.origin.code != "constant":  # constants of nature are left out
+        if one.why.code != "constant":  # constants of nature are left out
             low, median, high = (value_in_unit(value, one.unit) for value in (one.low, one.median, one.high))
             band = "–" if one.low == one.high else f"{low} to {high}"
-            rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.origin)))
+            rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.why)))
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     columns = ("prediction", "at y/L", "median", "90 % band", "unit")
@@ -229,7 +227,7 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
     yield from (f"! {warning}" for warning in prediction.hazards)
 
 
-def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
+def _quantity_row(quantity: Band) -> tuple[str, str, str, str, str]:
     """Return name, place, median, band and unit; stresses are in MPa, and forces in mN if all are small."""
     place = "" if math.isnan(quantity.y_over_L) else f"{quantity.y_over_L:g}"
     values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
@@ -274,7 +272,7 @@ def _json_entry(prediction: VinePrediction) -> dict[str, Any]:
         "condition": prediction.inputs.trial.condition,
         "model": list(prediction.inputs.model.names),
         "samples": prediction.samples,
-        "inputs": [_band(one) | {"from": str(one.origin)} for one in prediction.inputs.bands()],
+        "inputs": [_band(one) | {"from": str(one.why)} for one in prediction.inputs.bands()],
         "quantities": [_band(one) | {"y_over_L": one.y_over_L} for one in prediction.quantities],
         "uncertainties": [
             {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
@@ -287,7 +285,7 @@ def _json_entry(prediction: VinePrediction) -> dict[str, Any]:
     }
 
 
-def _band(one: Input | Quantity) -> dict[str, Any]:
+def _band(one: Band) -> dict[str, Any]:
     return {"name": one.name, "unit": one.unit, "median": one.median, "low_90": one.low, "high_90": one.high}
 
 

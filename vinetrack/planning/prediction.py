@@ -29,6 +29,7 @@ from vinetrack.planning.predictive_inputs import (
     BAND,
     BURST_STRESS_PA,
     YIELD,
+    Band,
     FitNumbers,
     PredictiveInputs,
     StatedValues,
@@ -91,30 +92,6 @@ TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """One predicted quantity with its 90 % band, SI. `y_over_L` is where it is evaluated, NaN where it belongs to no
-    place. For draws that never get there the time is infinite and the speed 0.
-    """
-
-    name: str
-    y_over_L: float
-    low: float
-    median: float
-    high: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """The 90 % band of the final speed, m/s, with one uncertain input; `name` and `why` are those of the input."""
-
-    name: str
-    why: Remark
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class Neglected:
     """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
 
@@ -138,21 +115,21 @@ class VinePrediction:
 
     inputs: PredictiveInputs
     at_fraction: float
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[Band, ...]
     curve: pd.DataFrame
-    shares: tuple[Contribution, ...]
+    shares: tuple[Band, ...]
     arrives: float
     slack: float
     samples: int
 
     @property
-    def final(self) -> Quantity:
+    def final(self) -> Band:
         """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`. Where the tail may
         go slack, the payload moves on its own and is not simulated: then that of the leading edge.
         """
         return self[EJECTION if told_by_payload(self.inputs.trial) else EDGE]
 
-    def __getitem__(self, name: str) -> Quantity:
+    def __getitem__(self, name: str) -> Band:
         """Return the quantity of that name; KeyError where there is none."""
         return {quantity.name: quantity for quantity in self.quantities}[name]
 
@@ -227,11 +204,11 @@ def predict_vine(
     tension_N, pressure_Pa, least_N, slack = _forces(model, trials[:300], rows, moved, places_m)
 
     r, stress_Pa = trial.travel_ratio, hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    quantities: list[Quantity] = []
+    quantities: list[Band] = []
 
     def tell(name: str, where: float, values: Floats, unit: str) -> None:
         low, median, high = band(values).tolist()
-        quantities.append(Quantity(name, where, low, median, high, unit))
+        quantities.append(Band(name, unit, low, median, high, where))
 
     if trial.payload_kg > 0:
         if told_by_payload(trial) or not slack.any():
@@ -254,8 +231,8 @@ def predict_vine(
     for uncertainty in inputs.uncertainties:
         # 400: draws for the band of one uncertainty alone (derived)
         alone = drawn_final_speeds(inputs, at_fraction, min(samples, 400), seed, [uncertainty.name])
-        low, _, high = band(alone).tolist()
-        shares.append(Contribution(uncertainty.name, uncertainty.why, low, high))
+        low, median, high = band(alone).tolist()
+        shares.append(Band(uncertainty.name, "m/s", low, median, high, why=uncertainty.why))
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,

@@ -114,40 +114,35 @@ BAND = (0.05, 0.5, 0.95)  # Convention: median and 90 % band of a prediction
 Draws = dict[str, Floats]  # Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure
 
 
-def _varied(values: Floats, change: Floats, how: str) -> Floats:
-    """Values with a change `added` to them, to their `logarithm`, `relative` to them, or they are `replaced` by it."""
-    if how == "logarithm":
-        return np.asarray(values * np.exp(change))
-    if how == "relative":
-        return values * (1 + change)
-    return change if how == "replaced" else values + change
-
-
 @dataclass(frozen=True)
 class Uncertainty:
     """One uncertainty. `key` names its stream of random numbers: uncertainties of the same key vary together, in
-    different vines too. `of` are the inputs that vary with it, each as `_varied` says, by `changes(generator, n)`,
-    shape (n_inputs, n).
+    different vines too. `of` are the inputs that vary with it, and whether as their logarithm, by the changes that
+    `draw(generator, n)` returns, shape (n_inputs, n).
     """
 
     name: str
     why: Remark
     key: str
-    of: Mapping[str, str]
-    changes: Callable[[np.random.Generator, int], Any] = field(repr=False, compare=False)
+    of: Mapping[str, bool]
+    draw: Callable[[np.random.Generator, int], Any] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
-class Input:
-    """One input of a prediction: median and 90 % band, SI, and their origin."""
+class Band:
+    """Median and 90 % band of an input or of a predicted quantity, SI. `y_over_L` is where a quantity is evaluated, NaN
+    where it belongs to no place; for draws that never get there the time is infinite and the speed 0. `why` is the
+    origin of an input, or of an uncertainty that is the only one in this band.
+    """
 
     name: str
-    symbol: str
     unit: str
     low: float
     median: float
     high: float
-    origin: Remark
+    y_over_L: float = math.nan
+    symbol: str = ""
+    why: Remark = field(default_factory=Remark)
 
 
 @dataclass(frozen=True)
@@ -174,9 +169,9 @@ class PredictiveInputs:
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for one in self.uncertainties:
             if only is None or one.name in only:
-                changes = one.changes(np.random.default_rng([seed, zlib.crc32(one.key.encode())]), count)
-                for (name, how), change in zip(one.of.items(), changes, strict=True):
-                    draws[name] = _varied(draws[name], change, how)
+                changes = one.draw(np.random.default_rng([seed, zlib.crc32(one.key.encode())]), count)
+                for (name, is_log), change in zip(one.of.items(), changes, strict=True):
+                    draws[name] = draws[name] * np.exp(change) if is_log else draws[name] + change
         bounds = {name: parameter.bounds for name, _, parameter in _parameters(self.model)}
         return {name: np.clip(values, *bounds.get(name, (0.0, math.inf))) for name, values in draws.items()}
 
@@ -189,16 +184,16 @@ class PredictiveInputs:
         pairs = zip(draws[PRESSURE].tolist(), draws[YIELD].tolist(), strict=True)
         return [replace(self.trial, pressure_Pa=P, yield_pressure_Pa=P_y) for P, P_y in pairs], rows
 
-    def bands(self) -> list[Input]:
+    def bands(self) -> list[Band]:
         """Every input with its 90 % band; fixed inputs have a band of zero width."""
         draws = self.draw(4000, 1)
-        named = {name: (parameter.symbol, parameter.unit) for name, _, parameter in _parameters(self.model)}
-        named |= {YIELD: ("P_y", "Pa"), PRESSURE: ("P", "Pa")}
-        first = [name for name in (DAMPING, EXPONENT, YIELD, PRESSURE) if name in draws]
+        named = {name: (parameter.unit, parameter.symbol) for name, _, parameter in _parameters(self.model)}
+        named |= {YIELD: ("Pa", "P_y"), PRESSURE: ("Pa", "P")}
         bands = []
-        for name in dict.fromkeys([*first, *draws]):
-            low, median, high = np.quantile(draws[name], BAND).tolist()
-            bands.append(Input(name, *named[name], low, median, high, self.origins.get(name, Remark())))
+        for name in dict.fromkeys([*(name for name in (DAMPING, EXPONENT, YIELD, PRESSURE) if name in draws), *draws]):
+            (unit, symbol), (low, median, high) = named[name], np.quantile(draws[name], BAND).tolist()
+            why = self.origins.get(name, Remark())
+            bands.append(Band(name, unit, low, median, high, symbol=symbol, why=why))
         return bands
 
 
@@ -240,10 +235,18 @@ def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[
 
 @dataclass(frozen=True)
 class FitNumbers:
-    """The parameters of a fit as of a new trial, see `fit_numbers`."""
+    """The parameters of a fit, in memory or from `fit.json`, as of a new trial."""
 
-    source: str
     fit: Fit | FitSummary
+    source: str = "the fit"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.fit, Fit) and self.fit.refused:
+            raise FitError(f"{self.source} holds no fit to predict from: {self.fit.refused}")
+        if not self.fit.numbers:
+            raise FitError(f"{self.source} holds a fit without numbers: there is nothing to predict from.")
+        if not any(number.key == DAMPING for number in self.fit.numbers):
+            raise FitError(f"{self.source} is not a fit of everting vines: it has no B to predict with.")
 
     def place(self, key: str, vine: str = "", near: float = math.nan) -> int | None:
         """The index of a parameter, shared or of this vine; None where there is none. Of several yield pressures of a
@@ -283,17 +286,6 @@ class FitNumbers:
             if math.isfinite(self.fit.covariance[k, k]):
                 scale[k] = _widening(fitted) / (fitted.value if _is_log(fitted) else 1.0)
         return np.asarray(np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale)
-
-
-def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
-    """Read the parameters of a fit, in memory or from `fit.json`."""
-    if not isinstance(fit, Fit) and fit.refused:
-        raise FitError(f"{source} holds no fit to predict from: {fit.refused}")
-    if not fit.numbers:
-        raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
-    if not any(number.key == DAMPING for number in fit.numbers):
-        raise FitError(f"{source} is not a fit of everting vines: it has no B to predict with.")
-    return FitNumbers(source, fit)
 
 
 def _is_log(number: Number) -> bool:
@@ -371,33 +363,33 @@ class _Assembly:
         self.set(name, factor * self.fit.fit.numbers[place].value, origin, source=self.fit.source, **facts)
 
     def vary(
-        self, name: str, sigma: float, title: str, key: str, why: Remark, how: str = "added", dof: float = math.inf
+        self, name: str, sigma: float, title: str, key: str, why: Remark, *, log: bool = False, dof: float = math.inf
     ) -> None:
-        """Let an input vary by sigma times a normal deviate, or one of Student's t, if that is any."""
+        """Let an input, or its logarithm, vary by sigma times a normal deviate, or one of Student's t, if any."""
 
-        def changes(draw: np.random.Generator, count: int) -> list[Floats]:
+        def draw(rng: np.random.Generator, count: int) -> list[Floats]:
             if math.isinf(dof):
-                return [sigma * draw.standard_normal(count)]
-            return [sigma * np.clip(draw.standard_t(dof, count), -20.0, 20.0)]
+                return [sigma * rng.standard_normal(count)]
+            return [sigma * np.clip(rng.standard_t(dof, count), -20.0, 20.0)]
 
         if sigma != 0:
-            self.uncertainties.append(Uncertainty(title, why, key, {name: how}, changes))
+            self.uncertainties.append(Uncertainty(title, why, key, {name: log}, draw))
 
     def damping(self) -> None:
         """B: as stated, fitted or printed; else by the scaling prior, from the nearest vine of the fit if any."""
         vine, fit, stated = self.trial.vine, self.fit, self.stated
         place = fit.place(DAMPING, self.vine) if fit else None
         if math.isfinite(stated.B):
-            why = remark("B_given", percent=100 * stated.B_error)
+            error, why = max(stated.B_error, 0.0), remark("B_given", percent=100 * stated.B_error)
             self.set(DAMPING, stated.B, "given")
-            self.vary(DAMPING, max(stated.B_error, 0.0), "error of B", f"B given|{vine}", why, "logarithm")
+            self.vary(DAMPING, error, "error of B", f"B given|{vine}", why, log=True)
         elif fit is not None and place is not None and (self.is_same or fit.fit.numbers[place].vine == ""):
             self.set_fitted(DAMPING, place)
         elif place is None and self.printed_scale is not None:
             error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
             why = remark("B_printed", percent=100 * error)
             self.set(DAMPING, published.DAMPING_B[self.printed_scale], "printed", source=published.SOURCE)
-            self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, "logarithm")
+            self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
             self._damping_by_scaling(place)
 
@@ -414,11 +406,11 @@ class _Assembly:
             self.notes.append(remark("B_carried_over", source=self.fit.source, vine=self.vine))
             split -= _split_leverage(*like)
         why = remark("printed_B_scatter", printed=100 * damping_scatter(), here=100 * scatter, dof=SCATTER_DOF)
-        self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, "logarithm", SCATTER_DOF)
+        self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, log=True, dof=SCATTER_DOF)
         if abs(split) > 1e-9:
             sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
             why = remark("one_t_over_D", sigma=sigma, here=100 * abs(split) * sigma)
-            self.vary(DAMPING, split * sigma, "t against D", "B split", why, "logarithm")
+            self.vary(DAMPING, split * sigma, "t against D", "B split", why, log=True)
 
     def exponent(self) -> None:
         """n: as stated, fitted or printed."""
@@ -458,7 +450,7 @@ class _Assembly:
         else:
             self.set(YIELD, 1000 * printed_kPa, "P_y_guessed")
             sigma = math.log(3.0) / 1.6448536269514722  # nine of ten vines within a factor of 3
-            self.vary(YIELD, sigma, "guess of P_y", "P_y guess", remark("P_y_guess", kPa=printed_kPa), "logarithm")
+            self.vary(YIELD, sigma, "guess of P_y", "P_y guess", remark("P_y_guess", kPa=printed_kPa), log=True)
 
     def other_parameters(self, model: Model) -> None:
         """Parameters of all other effects: as stated, as fitted, or at their typical size."""
@@ -482,8 +474,9 @@ class _Assembly:
             self.notes.append(remark("implausible", **facts, low=least, high=most, unit=unit))
         if high > low:
             title, why = f"{parameter.symbol} ({effect.name})", remark("uniform", **facts, low=low, high=high)
-            how = {name: "replaced"}
-            self.uncertainties.append(Uncertainty(title, why, name, how, lambda draw, n: [draw.uniform(low, high, n)]))
+            ends = low - self.values[name], high - self.values[name]
+            uniform = Uncertainty(title, why, name, {name: False}, lambda rng, n: [rng.uniform(*ends, n)])
+            self.uncertainties.append(uniform)
 
     def joint_draw_of_fit(self) -> None:
         """Draw all inputs that the fit provides jointly, with their covariance."""
@@ -491,15 +484,15 @@ class _Assembly:
             return
         source, fit, places = self.fit.source, self.fit.fit, list(self.from_fit.values())
         mean, covariance = np.zeros(len(places)), self.fit.covariance[np.ix_(places, places)]
-        how = {name: "logarithm" if _is_log(fit.numbers[place]) else "added" for name, place in self.from_fit.items()}
+        is_log = {name: _is_log(fit.numbers[place]) for name, place in self.from_fit.items()}
         symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
         shown = ", ".join(symbols.get(name, name) for name in self.from_fit)
         why = remark("with_covariance", names=shown, source=source, count=len(fit.trials))
 
-        def changes(draw: np.random.Generator, count: int) -> Floats:
-            return draw.multivariate_normal(mean, covariance, count, method="svd").T
+        def draw(rng: np.random.Generator, count: int) -> Floats:
+            return rng.multivariate_normal(mean, covariance, count, method="svd").T
 
-        self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", how, changes))
+        self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", is_log, draw))
         is_known = np.isfinite(np.diag(fit.covariance))
         if not is_known.all():
             of_open = [number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known]
@@ -521,9 +514,10 @@ class _Assembly:
             few = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
             dof |= {{"pressure": "P"}.get(name, name): few for name, one in fit.spreads.items() if one.estimated}
         self.set(PRESSURE, trial.pressure_Pa, "set")
-        for symbol, name, size, how in (("P", PRESSURE, pressure, "relative"), ("B", DAMPING, damping, "logarithm")):
+        for symbol, name, size in (("P", PRESSURE, pressure), ("B", DAMPING, damping)):
             why, key = remark("spread", origin=origin, percent=100 * size), f"{symbol} trial|{trial.vine}"
-            self.vary(name, max(size, 0.0), f"{symbol} from trial to trial", key, why, how, dof[symbol])
+            sigma, log = max(size, 0.0) * (trial.pressure_Pa if symbol == "P" else 1.0), symbol == "B"
+            self.vary(name, sigma, f"{symbol} from trial to trial", key, why, log=log, dof=dof[symbol])
         return pressure, damping
 
 
@@ -561,7 +555,7 @@ def predictive_inputs(
     stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):
         stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
-        fit = fit_numbers(fit)
+        fit = FitNumbers(fit)
     names = [*(fit.fit.names if fit else stated.model), *stated.effects]
     model = make_model(dict.fromkeys(names), stated.user_effects)
     made = _Assembly(trial if trial.vine else with_names([trial])[0], stated, fit)
