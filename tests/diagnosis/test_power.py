@@ -14,7 +14,7 @@ from vinetrack.core.records import Trial
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import campaign_power, linear_power
 from vinetrack.diagnosis import further_trials as advice
-from vinetrack.diagnosis.campaign_power import CampaignDesign, FilmingPlan, make, planned_tests
+from vinetrack.diagnosis.campaign_power import planned_tests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
@@ -24,27 +24,22 @@ from vinetrack.planning.predictive_inputs import damping_prior
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 
 
-def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells) -> CampaignDesign:
+def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), noise_m=1e-4, candidates=CANDIDATES, **cells):
     trials: list[Trial] = []
     known = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "yield_pressure_kPa": "3", **cells}
     for pressure in kPa:
         trial = vt.planned_trial({"pressure_kPa": f"{pressure}", **known}).trials[0]
         trials += [replace(trial, name=f"P{pressure}_{k}", position_systematic_m=0.0) for k in range(replicates)]
-    return with_trials(CampaignDesign(vt.predictive_inputs(trials[0]).model, (), (), spreads, candidates), trials)
+    return vt.predictive_inputs(trials[0]).model, trials, [500.0] * len(trials), spreads, (noise_m, 0.0), candidates
 
 
-def with_trials(design: CampaignDesign, added) -> CampaignDesign:
-    trials = (*design.trials, *added)
-    return replace(design, trials=trials, cameras=(FilmingPlan(500.0, 1e-4),) * len(trials))
-
-
-def power_with(design: CampaignDesign, **how: bool) -> Power:
-    return linear_power.power_of(planned_tests(design)[0], **how)
+def power_with(design: tuple, **how: bool) -> Power:
+    return linear_power.power_of(planned_tests(*design)[0], **how)
 
 
 @pytest.fixture(scope="module")
 def six():
-    return planned_tests(planned(2))[0]
+    return planned_tests(*planned(2))[0]
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +52,10 @@ def place_of(questions, name: str) -> int:
 
 
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
-    design = replace(planned(2), cameras=(FilmingPlan(500.0, 1e-3),) * 6)
-    promised = planned_tests(design)[0].fit
-    pairs = make(design.model, design.trials, design.cameras, design.spreads, np.random.default_rng(1))
-    filmed = vt.fit(design.to_fit, pairs, spreads=design.spreads, noise=(1e-3, 0.0), profile=False)
+    design = planned(2, noise_m=1e-3)
+    promised = planned_tests(*design)[0].fit
+    pairs = campaign_power.filmed_again(promised, np.random.default_rng(0))
+    filmed = vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0), profile=False)
     assert [n.sigma for n in promised.numbers] == pytest.approx([n.sigma for n in filmed.numbers], rel=0.04)
     precisions = [fit.solution.problem.release_origin_precision for fit in (promised, filmed)]
     assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
@@ -124,18 +119,9 @@ def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate()
 
 @pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect():
-    found = campaign_power.simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
+    found = campaign_power.simulated_diagnosis(planned_tests(*planned(2, (0.002, 0.006)))[0], "leak", (0.02,), 3)
     assert found.failed == ""
     assert found.found
-
-
-def test_the_design_of_a_fit_records_as_long_as_its_trials():
-    fit = planned_tests(planned(1))[0].fit
-    design = campaign_power.design_of_fit(fit)
-    for camera, trial in zip(design.cameras, fit.trials, strict=True):
-        assert camera.stops_s == pytest.approx(trial.time_s[-1] - trial.release_s)
-        assert camera.capture_fps == pytest.approx(500.0)
-    assert design.spreads == (0.01, 0.03)
 
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0))
@@ -144,7 +130,7 @@ LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0)
 @pytest.fixture(scope="module")
 def few():
     design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
-    tests = planned_tests(design)[0]
+    tests = planned_tests(*design)[0]
     return design, tests, linear_power.power_of(tests, nonlinear=True)
 
 
@@ -153,9 +139,12 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
     further = advice.further_trials(tests, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
     pressures = [1e3 * added["pressure_kPa"] for added in further.trials]
-    like = design.trials[0]
+    model, trials, rates, *rest = design
+    like = trials[0]
     made = [replace(like, name=f"a{k}", pressure_Pa=P, pressure_sigma_Pa=0.01 * P) for k, P in enumerate(pressures)]
-    again = linear_power.effect_power(planned_tests(with_trials(design, made))[0], "leak")
+    again = linear_power.effect_power(
+        planned_tests(model, trials + made, rates[:1] * len(trials + made), *rest)[0], "leak"
+    )
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
     fewer = [added for added in further.trials if added["probability"] < further.target]
     assert len(fewer) == len(further.trials) - 2

@@ -189,7 +189,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder, 
 def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypatch):
     asked_for: list[tuple[str, int]] = []
 
-    def answered(_design: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
+    def answered(_tests: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
         asked_for.append((effect, seed))
         return SimulatedDiagnosis("leak", True) if effect and seed % 2 else SimulatedDiagnosis()
 

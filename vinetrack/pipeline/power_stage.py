@@ -19,9 +19,6 @@ from vinetrack.core.terminal import progress, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
-    CampaignDesign,
-    FilmingPlan,
-    design_of_fit,
     fitted_tests,
     planned_tests,
     rates_of,
@@ -89,8 +86,7 @@ class PowerRequest:
         return (sigma_m, correlation), (of_P, of_B), inputs
 
 
-# Power by linear theory, the tests that it is of, how to simulate such campaigns, and constraints on further trials
-Campaign = tuple[Power, MisfitTests, CampaignDesign, Limits]
+Campaign = tuple[Power, MisfitTests, Limits]  # Power, the tests that it is of, and constraints on further trials
 
 
 def _campaign_of_target(request: PowerRequest) -> Campaign:
@@ -131,8 +127,7 @@ def _measured_campaign(
     else:
         inputs = []
     tests, not_testable = fitted_tests(fitted, candidates)
-    power = power_of(tests, not_testable, inputs, nonlinear=True)
-    return power, tests, design_of_fit(fitted, candidates), limits
+    return power_of(tests, not_testable, inputs, nonlinear=True), tests, limits
 
 
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
@@ -146,19 +141,19 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
     usual = "guess: a usual batch of vines"
     noise, spreads, inputs = request.scatter((1e-4, 0.0), "guess", first.spreads, usual)
     systematic_m, systematic_origin = _planned_systematic(request, planned)
-    trials, cameras = [], []
+    trials, rates = [], []
     for trial in planned.trials:
         if not math.isfinite(trial.yield_pressure_Pa):
             assumed_Pa = by_vine[trial.vine].trial.yield_pressure_Pa
             trial = replace(trial, yield_pressure_Pa=assumed_Pa, yield_pressure_sigma_Pa=1e3 * YIELD_SIGMA_KPA)
         trials.append(replace(trial, position_systematic_m=systematic_m))
-        rates = (request.capture_fps, trial.capture_fps, 1069.0)  # the last: chosen
-        cameras.append(FilmingPlan(next(filter(math.isfinite, rates)), *noise))
+        known = (request.capture_fps, trial.capture_fps, 1069.0)  # the last: chosen
+        rates.append(next(filter(math.isfinite, known)))
     is_in_sheet = all(math.isfinite(trial.capture_fps) for trial in trials)
     fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
     inputs += [
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
-        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", fps_origin),
+        PowerInput("frame rate", f"{rates[0]:g} /s", fps_origin),
         *(
             PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", str(of_vine.origins[key]))
             for vine, of_vine in by_vine.items()
@@ -166,9 +161,8 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
         ),
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
-    design = CampaignDesign(model, tuple(trials), tuple(cameras), spreads, settings.candidates)
-    tests, not_testable = planned_tests(design)
-    return power_of(tests, not_testable, inputs, nonlinear=True), tests, design, settings.limits
+    tests, not_testable = planned_tests(model, trials, rates, spreads, noise, settings.candidates)
+    return power_of(tests, not_testable, inputs, nonlinear=True), tests, settings.limits
 
 
 def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
@@ -187,16 +181,16 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
-            now, tests, design, limits = _campaign_of_target(request)
+            now, tests, limits = _campaign_of_target(request)
         elif isinstance(given, Fit):
             tests, not_testable = fitted_tests(given)
-            now, design, limits = power_of(tests, not_testable, nonlinear=True), design_of_fit(given), Limits()
+            now, limits = power_of(tests, not_testable, nonlinear=True), Limits()
         else:
             base = make_model(BASE_EFFECTS)
-            now, tests, design, limits = _measured_campaign(request, base, list(given), None, Limits())
+            now, tests, limits = _measured_campaign(request, base, list(given), None, Limits())
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
-        power = replace(power, simulated=tuple(_simulated_rates(request, design, now, asked)))
+        power = replace(power, simulated=tuple(_simulated_rates(request, tests, now, asked)))
     if math.isfinite(request.reach):
         for text, (name, value) in zip(request.effects, asked, strict=True):
             if name in power.not_testable:
@@ -243,9 +237,9 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
 
 
 def _simulated_rates(
-    request: PowerRequest, design: CampaignDesign, power: Power, asked: Sequence[tuple[str, float]]
+    request: PowerRequest, tests: MisfitTests, power: Power, asked: Sequence[tuple[str, float]]
 ) -> Iterator[SimulatedRates]:
-    """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind, the null first."""
+    """Simulate campaigns like that of the tests, diagnose each in full; yield the rate of each kind, the null first."""
     wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
     for entry, size in ((power[name], size) for name, size in asked if name not in power.not_testable):
         sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
@@ -253,6 +247,6 @@ def _simulated_rates(
         wanted += [(entry.effect, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
     for effect, values, predicted_rate in wanted:
-        done = map_unordered(partial(simulated_diagnosis, design, effect, values), seeds, request.jobs)
+        done = map_unordered(partial(simulated_diagnosis, tests, effect, values), seeds, request.jobs)
         diagnoses = list(progress(done, f"campaigns with {effect or 'nothing missing'}", len(seeds)))
         yield rates_of(effect, diagnoses, values[0], predicted_rate)

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
+from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, RIG, with_names
 from vinetrack.experiment.settings import Limits
@@ -275,8 +276,9 @@ def extended(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> tuple[Pre
 
 
 def extended_fit(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> Fit:
-    """The fit with further trials, linearised at its parameters and not refitted."""
+    """The fit with further trials, as `filmed`, linearised at its parameters and not refitted."""
     predictor, problem, state = extended(fit, films)
+    state.trial_effects[len(fit.trials) :] = 0.0
     columns = tuple(predictor.linearise(state.theta, state.trial_effects))
     cross_products = predictor.products(columns)
     known = replace(fit.solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
@@ -332,15 +334,15 @@ def _filming(fit: Fit) -> tuple[int, float]:
     return max(int(np.median([trial_data.n_rest for trial_data in data])), 3), 1.5 * float(max(moving_s))
 
 
-def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> tuple[Jobs, list[Trajectory | None]]:
-    """Jobs and trajectories of trials as the fit predicts them, see `_simulated`."""
+def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> tuple[Jobs, list[Any]]:
+    """Jobs and trajectories of trials that are released at time and position 0, see `_simulated`."""
     predictor, _, state = extended(fit, blanks)
-    state.trial_effects[len(fit.trials) :, ORIGIN] = 0.0
+    state.trial_effects[len(fit.trials) :] = 0.0
     jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
     return jobs, _simulated(predictor, jobs)
 
 
-def _simulated(predictor: Predictor, jobs: Jobs) -> list[Trajectory | None]:
+def _simulated(predictor: Predictor, jobs: Jobs) -> list[Any]:
     """Trajectories of all jobs; None for those that cannot be simulated, found by bisection."""
     try:
         return list(predictor.run(jobs))
@@ -368,25 +370,47 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     ]
     # 1.05: the ratio above which the model predicts compression in the tail (chosen)
     largest_ratio = max(1.05, *filter(math.isfinite, seen))
-    films = []
+    blanks = []
     for condition, job, *moved in zip(conditions, runs[-1][0], *(run for _, run in runs), strict=True):
         trial, moving = condition.trial, [course for course in moved if course is not None]
         if len(moving) < len(fits):
             continue
-        near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
-        near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in moving)
+        near_s = _near_end_s(trial, moving)
         grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
-        ratio, frame_s = _speed_ratio(fit, trial, job, moving[-1].tail_velocity_m_s), _frame_s(fit, condition)
+        ratio = _speed_ratio(fit, trial, job, moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
-        grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * frame_s
+        grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * _frame_s(fit, condition)
         if grows_enough and (trial.tail_slack == "free" or ratio <= largest_ratio):
-            films.append((condition, _blank(fit, condition, frame_s * np.arange(1 - rest_frames, near_s / frame_s))))
-    _, moved = _courses(fits[0], films) if films else (None, [])
+            # Once more on a grid that ends soon after the growth
+            blanks.append((condition, _blank(fit, condition, np.linspace(0.0, near_s + grid_s[1], grid_s.size))))
+    runs = [_courses(each, blanks) for each in fits] if blanks else []
     return [
-        (condition, replace(film, lead_position_m=course.observed_position_m))
-        for (condition, film), course in zip(films, moved, strict=True)
-        if course is not None
+        (condition, _film(fit, condition, _near_end_s(condition.trial, moved), moved[0], rest_frames))
+        for (condition, _), *moved in zip(blanks, *(run for _, run in runs), strict=True)
     ]
+
+
+def _near_end_s(trial: Trial, courses: Sequence[Trajectory]) -> float:
+    """When the first of these courses nears the end of the growth, s, or ends."""
+    near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
+    return min(float(np.interp(near_m, course.lead_position_m, course.time_s)) for course in courses)
+
+
+def _film(fit: Fit, condition: Condition, near_s: float, course: Trajectory, rest_frames: int) -> FitTrial:
+    """A film of a course at points that stand for the frames around them, the first one for those at rest: what frames
+    themselves tell of a quick vine depends on where in a frame it is released.
+    """
+    points = 100  # Points of a film in motion (chosen)
+    step_s, frame_s, rho = near_s / points, _frame_s(fit, condition), fit.solution.state.rho
+    time_s = np.insert(step_s * (np.arange(points) + 0.5), 0, -frame_s)
+    frames = np.insert(np.full(points, step_s / frame_s), 0, rest_frames)
+    return replace(
+        _blank(fit, condition, time_s),
+        lead_position_m=np.interp(time_s, course.time_s, course.observed_position_m),
+        # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
+        first=np.ones(time_s.size, dtype=bool),
+        relative_sd=np.sqrt((1 + rho) / (1 - rho) / frames),
+    )
 
 
 def _frame_s(fit: Fit, condition: Condition) -> float:
@@ -454,19 +478,38 @@ def _noisy_films(
     effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(design))
     may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])[before:]
     effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
-    noise_m, films = np.sqrt(state.variance[-1] / (1 - state.rho**2)), []
-    moved = predictor.run(predictor.jobs(state.theta, state.trial_effects)[before:])
-    for (condition, blank), trajectory, of_trial in zip(blanks, moved, effects, strict=True):
-        stop = blank.time_s.size
-        if trajectory.status == "ended":
-            stop = int(np.searchsorted(blank.time_s, of_trial[RELEASE] + trajectory.end_time_s))
-        noise = ar1_noise(stop, noise_m, state.rho, rng)
-        position_m = of_trial[ORIGIN] + trajectory.observed_position_m[:stop] + noise
-        pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
+    jobs = predictor.jobs(state.theta, state.trial_effects)[before:]
+    films = []
+    for condition, (trial, track) in zip(design, tracks_of(predictor, state, jobs, rng), strict=True):
         with suppress(FitError):
-            track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
-            films.append((condition, prepare_trial(blank.trial, track)))
+            films.append((condition, prepare_trial(trial, track)))
     return films
+
+
+def tracks_of(
+    predictor: Predictor,
+    state: FitState,
+    jobs: Jobs,
+    rng: np.random.Generator,
+    times_s: Sequence[Floats] | None = None,
+    model: Model | None = None,
+) -> list[tuple[Trial, Track]]:
+    """Tracks of simulated trials, by the model of a fit or another, up to the end of growth and with its noise; at the
+    times of the trials unless at other ones.
+    """
+    tracks = []
+    times_s = times_s or [predictor.data[i].time_s for i in jobs.trial]
+    for i, time_s, trajectory in zip(jobs.trial.tolist(), times_s, predictor.run(jobs, times_s, model), strict=True):
+        film, release_s, origin_m = predictor.data[i], *state.trial_effects[i, [RELEASE, ORIGIN]]
+        ends_s = release_s + trajectory.end_time_s if trajectory.status == "ended" else math.inf
+        stop = int(np.searchsorted(time_s, ends_s))
+        noise_m = ar1_noise(stop, math.sqrt(state.variance[i] / (1 - state.rho**2)), state.rho, rng)
+        position_m = origin_m + trajectory.observed_position_m[:stop] + noise_m
+        pressure_Pa = None if film.trace is None else np.interp(time_s[:stop], *film.trace)
+        track = plain_track(time_s[:stop], position_m, pressure_Pa=pressure_Pa)
+        slow_m = np.full(stop, math.nan if film.slow_m is None else np.median(film.slow_m))
+        tracks.append((film.trial, replace(track, lead_position_systematic_m=slow_m)))
+    return tracks
 
 
 def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
