@@ -11,6 +11,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,9 +28,12 @@ from vinetrack.diagnosis.score_test import Products, products_without_trial_effe
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import at_unknowns, solve_per_trial
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, at_unknowns, solve_per_trial
+from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.sensitivity import ORIGIN, RELEASE
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.candidate_trials import (
     NEW_VINE,
@@ -37,11 +41,14 @@ from vinetrack.planning.candidate_trials import (
     SAME_RIG,
     Condition,
     at_solution,
+    blank_film,
     conditions_by_effort,
+    extended,
     extended_fit,
     feasible_conditions,
     filmed,
-    simulated_rises,
+    filming,
+    tracks_of,
 )
 
 # ------------------------------------------------------------------------------
@@ -286,6 +293,79 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
         "new_vine": condition.effort == NEW_VINE,
         "changed": list(condition.changed),
     }
+
+
+# ------------------------------------------------------------------------------
+# What further trials promise, found by simulating them and refitting the hypotheses to old and new trials.
+#
+# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, old
+# and new; between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can
+# explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
+
+
+def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draws: Sequence[int], seed: int) -> Floats:
+    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
+    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
+    average. Shape (n_draws, n, n).
+    """
+    n = len(tied)
+    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    rises = np.full((len(draws), n, n), math.nan)
+    before = np.array([-2 * fit.log_likelihood for fit in tied])
+    for k, a in np.ndindex(len(draws), n):
+        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * tied[a].solution.state.spread
+        try:
+            films = _noisy_films(tied[a], design, deviations, np.random.default_rng([seed, 0, draws[k], a]))
+        except SimulationError:
+            continue
+        if films:
+            after = np.array([_refitted(fit, films) for fit in tied])
+            rises[k, a] = after - before - (after[a] - before[a])
+    return rises
+
+
+def _noisy_films(
+    truth: Fit, design: Sequence[Condition], deviations: Floats, rng: np.random.Generator
+) -> list[tuple[Condition, FitTrial]]:
+    """Trials of a design simulated under a hypothesis, with random release, origin and noise, and prepared as for a
+    fit; without those that have too few points. Shapes: deviations (n_trials, 2).
+    """
+    (rest_frames, longest_s), before = filming(truth), len(truth.trials)
+    frames_s = truth.predictor.frames_s[[condition.like for condition in design]]
+    counts = rest_frames + np.ceil(longest_s / frames_s)
+    blanks = [
+        (condition, blank_film(truth, condition, frame_s * np.arange(count)))
+        for condition, frame_s, count in zip(design, frames_s, counts, strict=True)
+    ]
+    predictor, problem, state = extended(truth, blanks)
+    effects = state.trial_effects[before:]
+    effects[:, RELEASE] = [(rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
+    effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(design))
+    effects[:, DEVIATION_COLUMNS] = np.where(problem.has_deviation[before:], deviations, 0.0)
+    jobs = predictor.jobs(state.theta, state.trial_effects)[before:]
+    films = []
+    for condition, (trial, track) in zip(design, tracks_of(predictor, state, jobs, rng), strict=True):
+        with suppress(FitError):
+            films.append((condition, prepare_trial(trial, track)))
+    return films
+
+
+def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
+    """−2 ln L of a hypothesis fitted to old and further trials; NaN where the fit fails."""
+    most = 20  # Iterations of a refit, at most (chosen)
+    predictor, problem, state = extended(fit, films)
+    try:
+        # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
+        fixed = FixedTerms(state.spread, (state.rho, state.variance))
+        solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
+        solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
+        # These absorb part of what is wrong in a hypothesis, as in every fit.
+        smooth = smooth_errors(predictor, solution)
+    except SimulationError:
+        return math.nan
+    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
 
 
 # ------------------------------------------------------------------------------

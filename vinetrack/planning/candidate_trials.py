@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,11 +21,10 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, RIG, with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
-from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, FitState, MixedProblem
-from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.marginal_likelihood import FitState, MixedProblem
+from vinetrack.inference.optimiser import Solution, make_problem
 from vinetrack.inference.sensitivity import (
     N_TRIAL_EFFECTS,
     ORIGIN,
@@ -309,7 +307,7 @@ def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
 # Films of candidate trials, sampled as the camera of the experiment would.
 
 
-def _blank(fit: Fit, condition: Condition, time_s: Floats) -> FitTrial:
+def blank_film(fit: Fit, condition: Condition, time_s: Floats) -> FitTrial:
     """A trial of a condition at these times; its positions are placeholders, and a recorded pressure is constant."""
     trial, like = condition.trial, fit.predictor.data[condition.like]
     constant = (np.array([-1e3, 1e3]), np.full(2, trial.pressure_Pa))
@@ -327,7 +325,7 @@ def _blank(fit: Fit, condition: Condition, time_s: Floats) -> FitTrial:
     )
 
 
-def _filming(fit: Fit) -> tuple[int, float]:
+def filming(fit: Fit) -> tuple[int, float]:
     """Frames at rest before release, and the longest motion that is filmed, s: longer than any so far."""
     data = [trial_data for trial_data in fit.predictor.data if trial_data.trial.travel_ratio != 1]
     moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in data]
@@ -358,9 +356,9 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     nears the end of the growth. Conditions that are not worth filming, or for which the last model is in doubt, are
     left out.
     """
-    fit, (rest_frames, longest_s) = fits[-1], _filming(fits[-1])
+    fit, (rest_frames, longest_s) = fits[-1], filming(fits[-1])
     grid_s = np.linspace(0.0, longest_s, 400)
-    runs = [_courses(each, [(one, _blank(fit, one, grid_s)) for one in conditions]) for each in fits]
+    runs = [_courses(each, [(one, blank_film(fit, one, grid_s)) for one in conditions]) for each in fits]
     # The largest ratio of tail speed to steady speed among the trials so far
     made = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
     seen = [
@@ -379,10 +377,12 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
         grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
         ratio = _speed_ratio(fit, trial, job, moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
-        grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * _frame_s(fit, condition)
+        grows_enough = (
+            grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * fit.predictor.frames_s[condition.like]
+        )
         if grows_enough and (trial.tail_slack == "free" or ratio <= largest_ratio):
             # Once more on a grid that ends soon after the growth
-            blanks.append((condition, _blank(fit, condition, np.linspace(0.0, near_s + grid_s[1], grid_s.size))))
+            blanks.append((condition, blank_film(fit, condition, np.linspace(0.0, near_s + grid_s[1], grid_s.size))))
     runs = [_courses(each, blanks) for each in fits] if blanks else []
     return [
         (condition, _film(fit, condition, _near_end_s(condition.trial, moved), moved[0], rest_frames))
@@ -401,21 +401,16 @@ def _film(fit: Fit, condition: Condition, near_s: float, course: Trajectory, res
     themselves tell of a quick vine depends on where in a frame it is released.
     """
     points = 100  # Points of a film in motion (chosen)
-    step_s, frame_s, rho = near_s / points, _frame_s(fit, condition), fit.solution.state.rho
+    step_s, frame_s, rho = near_s / points, fit.predictor.frames_s[condition.like], fit.solution.state.rho
     time_s = np.insert(step_s * (np.arange(points) + 0.5), 0, -frame_s)
     frames = np.insert(np.full(points, step_s / frame_s), 0, rest_frames)
     return replace(
-        _blank(fit, condition, time_s),
+        blank_film(fit, condition, time_s),
         lead_position_m=np.interp(time_s, course.time_s, course.observed_position_m),
         # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
         first=np.ones(time_s.size, dtype=bool),
         relative_sd=np.sqrt((1 + rho) / (1 - rho) / frames),
     )
-
-
-def _frame_s(fit: Fit, condition: Condition) -> float:
-    """Frame interval of a condition: that of the trial it is modelled on."""
-    return fit.predictor.data[condition.like].frame_s
 
 
 def _speed_ratio(fit: Fit, trial: Trial, job: Jobs, tail_velocity_m_s: Floats) -> float:
@@ -429,61 +424,6 @@ def _speed_ratio(fit: Fit, trial: Trial, job: Jobs, tail_velocity_m_s: Floats) -
     if not (drive_N > 0 and B > 0 and n > 0.05):
         return math.inf if not drive_N > 0 else 0.0
     return float(np.max(tail_velocity_m_s)) / (drive_N / B) ** (1 / n)
-
-
-# ------------------------------------------------------------------------------
-# What further trials promise, found by simulating them and refitting the hypotheses to old and new trials.
-#
-# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
-# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, old
-# and new; between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can
-# explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
-
-
-def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draws: Sequence[int], seed: int) -> Floats:
-    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
-    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
-    average. Shape (n_draws, n, n).
-    """
-    n = len(tied)
-    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
-    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    rises = np.full((len(draws), n, n), math.nan)
-    before = np.array([-2 * fit.log_likelihood for fit in tied])
-    for k, a in np.ndindex(len(draws), n):
-        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * tied[a].solution.state.spread
-        try:
-            films = _noisy_films(tied[a], design, deviations, np.random.default_rng([seed, 0, draws[k], a]))
-        except SimulationError:
-            continue
-        if films:
-            after = np.array([_refitted(fit, films) for fit in tied])
-            rises[k, a] = after - before - (after[a] - before[a])
-    return rises
-
-
-def _noisy_films(
-    truth: Fit, design: Sequence[Condition], deviations: Floats, rng: np.random.Generator
-) -> list[tuple[Condition, FitTrial]]:
-    """Trials of a design simulated under a hypothesis, with random release, origin and noise, and prepared as for a
-    fit; without those that have too few points. Shapes: deviations (n_trials, 2).
-    """
-    (rest_frames, longest_s), before = _filming(truth), len(truth.trials)
-    frames_s = [_frame_s(truth, condition) for condition in design]
-    times = [s * np.arange(rest_frames + math.ceil(longest_s / s), dtype=float) for s in frames_s]
-    blanks = [(condition, _blank(truth, condition, time_s)) for condition, time_s in zip(design, times, strict=True)]
-    predictor, _, state = extended(truth, blanks)
-    effects = state.trial_effects[before:]
-    effects[:, RELEASE] = [(rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
-    effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(design))
-    may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])[before:]
-    effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
-    jobs = predictor.jobs(state.theta, state.trial_effects)[before:]
-    films = []
-    for condition, (trial, track) in zip(design, tracks_of(predictor, state, jobs, rng), strict=True):
-        with suppress(FitError):
-            films.append((condition, prepare_trial(trial, track)))
-    return films
 
 
 def tracks_of(
@@ -510,19 +450,3 @@ def tracks_of(
         slow_m = np.full(stop, math.nan if film.slow_m is None else np.median(film.slow_m))
         tracks.append((film.trial, replace(track, lead_position_systematic_m=slow_m)))
     return tracks
-
-
-def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
-    """−2 ln L of a hypothesis fitted to old and further trials; NaN where the fit fails."""
-    most = 20  # Iterations of a refit, at most (chosen)
-    predictor, problem, state = extended(fit, films)
-    try:
-        # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
-        fixed = FixedTerms(state.spread, (state.rho, state.variance))
-        solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
-        solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
-        # These absorb part of what is wrong in a hypothesis, as in every fit.
-        smooth = smooth_errors(predictor, solution)
-    except SimulationError:
-        return math.nan
-    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
