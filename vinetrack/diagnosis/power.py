@@ -86,11 +86,6 @@ class NumberWidth(JsonRecord):
     value: OrNaN
     half_width: OrNaN
 
-    @property
-    def is_relative(self) -> bool:
-        """Whether the half width is relative to the value."""
-        return self.name == "B"
-
 
 @dataclass(frozen=True)
 class PowerInput:
@@ -142,7 +137,7 @@ class SimulatedRates:
 
 
 @dataclass(frozen=True)
-class FurtherTrials:
+class FurtherTrials(JsonRecord):
     """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
     `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
     limits; `n_conditions` counts the conditions considered. `trials` has an entry for each trial to make: its cells of
@@ -150,12 +145,12 @@ class FurtherTrials:
     made as well.
     """
 
-    power: EffectPower
+    power: Annotated[EffectPower, Field(exclude=True)]
     value: float
-    target: float
-    before: float
-    unlimited: float = math.nan
-    n_conditions: int = 0
+    target: Annotated[float, Field(alias="wanted")]
+    before: Annotated[float, Field(alias="probability_before")]
+    unlimited: Annotated[float, Field(alias="probability_endless")] = math.nan
+    n_conditions: Annotated[int, Field(alias="conditions_looked_at")] = 0
     trials: tuple[Mapping[str, Any], ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
 
@@ -171,20 +166,8 @@ class FurtherTrials:
 
     def to_json(self) -> dict[str, Any]:
         """As the key `further_trials` of what `vinetrack power --json` writes."""
-        return {
-            "effect": self.power.effect,
-            "parameter": self.power.parameter,
-            "unit": self.power.unit,
-            "value": self.value,
-            "wanted": self.target,
-            "probability_before": self.before,
-            "probability_after": self.after,
-            "probability_endless": self.unlimited,
-            "conditions_looked_at": self.n_conditions,
-            "needed": dict(self.needed),
-            "taken_for": dict(self.power.taken_for),
-            "trials": list(self.trials),
-        }
+        told = {name: getattr(self.power, name) for name in ("effect", "parameter", "unit", "taken_for")}
+        return {**told, **super().to_json(), "probability_after": self.after}
 
 
 StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]

@@ -147,7 +147,7 @@ def power_lines(power: Power) -> list[str]:
     lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
     lines.append(false_alarm_sentence(power))
     if power.numbers:
-        halves = [percent(one.half_width) if one.is_relative else number(one.half_width, 2) for one in power.numbers]
+        halves = [percent(one.half_width) if one.name == "B" else number(one.half_width, 2) for one in power.numbers]
         names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
         lines.append(f"95 % intervals: {', '.join(map(' ± '.join, zip(names, halves, strict=True)))}.")
     for plan in power.further:

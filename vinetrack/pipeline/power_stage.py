@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError
+from vinetrack.core.problems import ExperimentError, Remark
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import progress, waiting
@@ -86,7 +86,8 @@ class PowerRequest:
         return (sigma_m, correlation), (of_P, of_B), inputs
 
 
-Campaign = tuple[Power, MisfitTests, Limits]  # Power, the tests that it is of, and constraints on further trials
+# Tests, what cannot be tested and why, the quantities assumed, and constraints on further trials
+Campaign = tuple[MisfitTests, Mapping[str, Remark], list[PowerInput], Limits]
 
 
 def _campaign_of_target(request: PowerRequest) -> Campaign:
@@ -126,8 +127,7 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
     else:
         inputs = []
-    tests, not_testable = fitted_tests(fitted, candidates)
-    return power_of(tests, not_testable, inputs, nonlinear=True), tests, limits
+    return *fitted_tests(fitted, candidates), inputs, limits
 
 
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
@@ -161,8 +161,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
         ),
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
-    tests, not_testable = planned_tests(model, trials, rates, spreads, noise, settings.candidates)
-    return power_of(tests, not_testable, inputs, nonlinear=True), tests, settings.limits
+    return *planned_tests(model, trials, rates, spreads, noise, settings.candidates), inputs, settings.limits
 
 
 def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
@@ -181,13 +180,13 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
-            now, tests, limits = _campaign_of_target(request)
+            campaign = _campaign_of_target(request)
         elif isinstance(given, Fit):
-            tests, not_testable = fitted_tests(given)
-            now, limits = power_of(tests, not_testable, nonlinear=True), Limits()
+            campaign = (*fitted_tests(given), [], Limits())
         else:
-            base = make_model(BASE_EFFECTS)
-            now, tests, limits = _measured_campaign(request, base, list(given), None, Limits())
+            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+        tests, not_testable, inputs, limits = campaign
+        now = power_of(tests, not_testable, inputs, nonlinear=True)
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, tests, now, asked)))

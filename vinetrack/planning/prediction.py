@@ -85,6 +85,8 @@ CURVE_COLUMNS = (
     "tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa",
 )  # fmt: skip
 
+WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
+
 TIME = "time to get there"
 EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
@@ -135,13 +137,61 @@ class VinePrediction:
 
     @cached_property
     def hazards(self) -> tuple[Remark, ...]:
-        """Warnings about the vine, most serious first."""
-        return (*_hazards(self), *self.inputs.notes)
+        """Warnings about the vine, most serious first: burst, no growth, a compressed or slack tail, and the audit."""
+        return (*self._hazards(), *self.inputs.notes)
+
+    def _hazards(self) -> Iterator[Remark]:
+        inputs, trial = self.inputs, self.inputs.trial
+        stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
+        if stress > 0.9 * BURST_STRESS_PA:
+            highest_kPa = trial.pressure_Pa / 1e3 * BURST_STRESS_PA / stress
+            facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
+            yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
+        low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
+        if median >= trial.pressure_Pa / 1e3:
+            yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
+        elif self.arrives < 1 - WARNING_FRACTION:
+            yield remark("stalls", share=1 - self.arrives)
+        if self.slack >= WARNING_FRACTION and trial.tail_slack == "free":
+            yield remark("goes_slack", share=self.slack)
+        elif self.slack >= WARNING_FRACTION:
+            tension, has_payload = self[LEAST_TENSION], trial.payload_kg > 0
+            facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
+            yield remark("tail_compressed", share=self.slack, **facts)
+        # The audit along the median motion, except of the tail, whose compression is told above
+        (moved,), _ = grown(inputs.model, [trial])
+        keep = moved.lead_position_m <= self.at_fraction * trial.length_m
+        motion = AuditedMotion(trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
+        violations = audit(inputs.model, [motion]).violations
+        yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
 
     @cached_property
     def neglected(self) -> tuple[Neglected, ...]:
-        """The final speed at the medians with each of the universal effects added, see `_neglected`."""
-        return _neglected(self.inputs, self.at_fraction)
+        """The final speed at the medians with each of the universal effects that the model leaves out, by itself,
+        largest change first; without those whose columns are blank.
+        """
+        host, trial = host_for(self.inputs.model), self.inputs.trial
+        # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
+        # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
+        kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
+        (without,) = final_speeds(self.inputs.model, [trial], self.at_fraction, host=host).tolist()
+        neglected_effects = []
+        # Effects that every vine has to some extent; the others of the catalogue may be absent.
+        universal = ("air_drag", "fold_inertia", "gas_inertia", "inlet_loss", "payload_drag", "reservoir_depletion")
+        for name in (*universal, "tail_friction", "wall_stretch"):
+            effect = catalogue()[name]
+            is_in_model = name in self.inputs.model or any(name in other.replaces for other in self.inputs.model)
+            if is_in_model or (name == "payload_drag" and trial.payload_kg == 0):
+                continue
+            sizes = {p: kappa if name == "wall_stretch" else p.default for p in effect.parameters}
+            model = (self.inputs.model + effect).with_values({f"{name}.{p.name}": value for p, value in sizes.items()})
+            try:
+                (final,) = final_speeds(model, [trial], self.at_fraction, host=host).tolist()
+            except EffectError:
+                continue
+            words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
+            neglected_effects.append(Neglected(name, ", ".join(words), final, without))
+        return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
 
     @property
     def table(self) -> pd.DataFrame:
@@ -219,7 +269,11 @@ def predict_vine(
     tell(TAIL, at_fraction, r * lead_m_s[:, place], "m/s")
     tell(TIME, at_fraction, time_s[:, place], "s")
     if DAMPING in model.parameter_names:
-        tell("steady tail speed, Eq. (3)", math.nan, _steady_tail_m_s(model, trials, rows), "m/s")
+        # Of (P − P_y)A = B ẋⁿ, without weight or further effects
+        B, n = (rows[:, model.parameter_names.index(key)] for key in (DAMPING, EXPONENT))
+        force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
+        with np.errstate(divide="ignore", over="ignore"):
+            tell("steady tail speed, Eq. (3)", math.nan, (force_N / B) ** (1 / n), "m/s")
     tell(TENSION, at_fraction, tension_N[:, place], "N")
     tell(LEAST_TENSION, math.nan, least_N, "N")
     tell("hoop stress PD/2t", math.nan, np.array([stress_Pa]), "Pa")
@@ -267,14 +321,6 @@ def _forces(
     return tension, pressure, least, is_slack
 
 
-def _steady_tail_m_s(model: Model, trials: Sequence[Trial], rows: Floats) -> Floats:
-    """Tail speed of (P − P_y)A = B ẋⁿ, without weight or further effects. Shape (n_trials,)."""
-    B, n = (rows[:, model.parameter_names.index(key)] for key in (DAMPING, EXPONENT))
-    force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
-    with np.errstate(divide="ignore", over="ignore"):
-        return np.asarray((force_N / B) ** (1 / n))
-
-
 def band(values: Floats) -> Floats:
     """Return the 5 %, 50 % and 95 % sample quantiles along the first axis, without interpolation (values may be inf).
     NaN where all draws are NaN. Shapes: values (n_draws, ...) → (3, ...).
@@ -282,64 +328,6 @@ def band(values: Floats) -> Floats:
     is_empty = np.isnan(values).all(axis=0)
     quantiles = np.asarray(np.nanquantile(np.where(is_empty, 0.0, values), BAND, axis=0, method="inverted_cdf"))
     return np.where(is_empty, np.nan, quantiles)
-
-
-# ------------------------------------------------------------------------------
-# Checks of a planned vine: burst, no growth, a compressed or slack tail, and effects that the model leaves out.
-
-WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
-
-
-def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
-    inputs, trial = prediction.inputs, prediction.inputs.trial
-    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    if stress > 0.9 * BURST_STRESS_PA:
-        highest_kPa = trial.pressure_Pa / 1e3 * BURST_STRESS_PA / stress
-        facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
-        yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
-    low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
-    if median >= trial.pressure_Pa / 1e3:
-        yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
-    elif prediction.arrives < 1 - WARNING_FRACTION:
-        yield remark("stalls", share=1 - prediction.arrives)
-    if prediction.slack >= WARNING_FRACTION and trial.tail_slack == "free":
-        yield remark("goes_slack", share=prediction.slack)
-    elif prediction.slack >= WARNING_FRACTION:
-        tension, has_payload = prediction[LEAST_TENSION], trial.payload_kg > 0
-        facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
-        yield remark("tail_compressed", share=prediction.slack, **facts)
-    # The audit along the median motion, except of the tail, whose compression is told above
-    (moved,), _ = grown(inputs.model, [trial])
-    keep = moved.lead_position_m <= prediction.at_fraction * trial.length_m
-    motion = AuditedMotion(trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
-    violations = audit(inputs.model, [motion]).violations
-    yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
-
-
-def _neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
-    """Each of the universal effects by itself, largest change first; without those whose columns are blank."""
-    host, trial = host_for(inputs.model), inputs.trial
-    # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
-    # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
-    kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
-    (without,) = final_speeds(inputs.model, [trial], at_fraction, host=host).tolist()
-    neglected_effects = []
-    # Effects that every vine has to some extent; the others of the catalogue may be absent.
-    universal = ("air_drag", "fold_inertia", "gas_inertia", "inlet_loss", "payload_drag", "reservoir_depletion")
-    for name in (*universal, "tail_friction", "wall_stretch"):
-        effect = catalogue()[name]
-        is_in_model = name in inputs.model or any(name in other.replaces for other in inputs.model)
-        if is_in_model or (name == "payload_drag" and trial.payload_kg == 0):
-            continue
-        sizes = {p: kappa if name == "wall_stretch" else p.default for p in effect.parameters}
-        model = (inputs.model + effect).with_values({f"{name}.{p.name}": value for p, value in sizes.items()})
-        try:
-            (final,) = final_speeds(model, [trial], at_fraction, host=host).tolist()
-        except EffectError:
-            continue
-        words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
-        neglected_effects.append(Neglected(name, ", ".join(words), final, without))
-    return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
 
 
 # ------------------------------------------------------------------------------

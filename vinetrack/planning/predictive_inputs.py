@@ -365,26 +365,25 @@ class _Assembly:
             self.set(DAMPING, published.DAMPING_B[self.printed_scale], "printed", source=published.SOURCE)
             self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
-            self._damping_by_scaling(place)
-
-    def _damping_by_scaling(self, place: int | None) -> None:
-        """B by the scaling prior. Its uncertainties are the scatter of the printed values about it, and the exponents
-        of t against D.
-        """
-        prior, split, scatter = damping_prior(*self.size), _split_leverage(*self.size), damping_log_sigma(*self.size)
-        if self.fit is None or place is None:
-            self.set(DAMPING, prior, "B_guessed")
-        else:
-            like = self.fit.sizes()[self.vine]
-            self.set_fitted(DAMPING, place, prior / damping_prior(*like), "B_scaled", vine=self.vine)
-            self.notes.append(remark("B_carried_over", source=self.fit.source, vine=self.vine))
-            split -= _split_leverage(*like)
-        why = remark("printed_B_scatter", printed=100 * damping_scatter(), here=100 * scatter, dof=SCATTER_DOF)
-        self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, log=True, dof=SCATTER_DOF)
-        if abs(split) > 1e-9:
-            sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-            why = remark("one_t_over_D", sigma=sigma, here=100 * abs(split) * sigma)
-            self.vary(DAMPING, split * sigma, "t against D", "B split", why, log=True)
+            # The uncertainties are the scatter of the printed values about the prior, and the exponents of t against D.
+            prior, split, scatter = (
+                damping_prior(*self.size),
+                _split_leverage(*self.size),
+                damping_log_sigma(*self.size),
+            )
+            if self.fit is None or place is None:
+                self.set(DAMPING, prior, "B_guessed")
+            else:
+                like = self.fit.sizes()[self.vine]
+                self.set_fitted(DAMPING, place, prior / damping_prior(*like), "B_scaled", vine=self.vine)
+                self.notes.append(remark("B_carried_over", source=self.fit.source, vine=self.vine))
+                split -= _split_leverage(*like)
+            why = remark("printed_B_scatter", printed=100 * damping_scatter(), here=100 * scatter, dof=SCATTER_DOF)
+            self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, log=True, dof=SCATTER_DOF)
+            if abs(split) > 1e-9:
+                sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
+                why = remark("one_t_over_D", sigma=sigma, here=100 * abs(split) * sigma)
+                self.vary(DAMPING, split * sigma, "t against D", "B split", why, log=True)
 
     def exponent(self) -> None:
         """n: as stated, fitted or printed."""
