@@ -285,10 +285,13 @@ def _recommendation(
 
 
 def _entry(condition: Condition, *more: str) -> dict[str, Any]:
-    """The cells of the sheet that may be chosen, and `more` of them, NaN where blank; and what is new about a trial."""
+    """The cells of the sheet that may be chosen, and `more` of them, NaN where blank; the unit in which the sheet has
+    the pressure; and what is new about a trial.
+    """
     names = [*(name for name, column in COLUMNS.items() if column.limit), *more]
     return {
         **{name: float(f"{COLUMNS[name].of_trial(condition.trial):.6g}") for name in names},
+        "pressure_unit": condition.trial.pressure_unit,
         "vine": condition.trial.vine,
         "new_vine": condition.effort == NEW_VINE,
         "changed": list(condition.changed),

@@ -189,12 +189,12 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         alike = list(group)
         new = ["a new vine"] if trial["new_vine"] else []
         new += [f"{(c := COLUMNS[name]).quantity} {trial.get(name, math.nan):g} {c.unit}" for name in trial["changed"]]
-        pressure, payload = f"{trial.get('pressure_kPa', math.nan):g}", f"{trial.get('payload_g', 0.0):g}"
+        pressure, payload = _pressure_of(trial), f"{trial.get('payload_g', 0.0):g}"
         then = percent(alike[-1]["probability"])
         rows.append((str(len(alike)), trial["vine"], pressure, payload, ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
-        lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
+        lines += [f"  {line}" for line in table(rows, head, ("", "", "", "g", "", ""), align="><>><>")]
     if not plan.is_reached:
         if plan.unlimited < plan.target:
             lines.append(
@@ -228,11 +228,15 @@ def measurement_text(effects: Sequence[Effect]) -> str:
     return " ".join(f"{name}: {words[0].lower()}{words[1:]}" for name, words in told if words)
 
 
+def _pressure_of(trial: Mapping[str, Any]) -> str:
+    return pressure_text(1e3 * trial["pressure_kPa"], trial.get("pressure_unit", "kPa"))
+
+
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     """Return the trials to make, as a list within a sentence."""
     told = []
     for trial in trials:
-        words = f"{_count(trial['replicates'], 'trial')} at {trial['pressure_kPa']:.3g} kPa"
+        words = f"{_count(trial['replicates'], 'trial')} at {_pressure_of(trial)}"
         if trial["payload_g"]:
             words += f" with {trial['payload_g']:.3g} g"
         size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
