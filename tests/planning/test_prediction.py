@@ -13,7 +13,6 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment import schema, settings
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.pipeline.predict_stage import read_sizes
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.candidate_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
@@ -183,7 +182,7 @@ def test_a_fit_from_python_is_believed_as_its_file_is():
     ],
 )
 def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):
-    assert read_sizes(text)[1] == sizes
+    assert guess.read_sizes(text)[1] == sizes
 
 
 def printed(scale: int) -> tuple[float, float]:
@@ -279,7 +278,7 @@ def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in_and_only_t
     speed = np.interp(0.95 * 0.25, found.lead_position_m, found.lead_velocity_m_s)
     assert drag.final_m_s == pytest.approx(speed, rel=1e-3)
     assert drag.change < 0
-    said = vt.StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
+    said = vt.StatedValues(effects=("air_drag",), sizes=guess.read_sizes("air_drag=1")[1])
     names = {one.effect for one in predicted(said).neglected}
     assert "air_drag" not in names
     assert "inlet_loss" not in names  # no inlet in the sheet

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -42,7 +42,6 @@ from vinetrack.planning.candidate_trials import (
     Condition,
     at_solution,
     blank_film,
-    conditions_by_effort,
     extended,
     extended_fit,
     feasible_conditions,
@@ -93,6 +92,22 @@ class Designs:
 
 
 Criterion = Callable[..., Floats]  # Worth of designs, shape (n_designs,), by the arguments of `Designs.left`
+
+
+def conditions_by_effort(
+    conditions: Sequence[Condition], best_new_vines: Callable[[NDArray[np.intp]], Sequence[str]]
+) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield the indices of the conditions to choose from with more and more effort: on the rig so far, with another
+    rig as well, and with one new vine at a time as well, of those that `best_new_vines` chooses among their indices.
+    """
+    efforts = np.array([condition.effort for condition in conditions])
+    for effort in (SAME_RIG, OTHER_RIG):
+        if (efforts == effort).any():
+            yield effort, np.flatnonzero(efforts <= effort)
+    new = np.flatnonzero(efforts == NEW_VINE)
+    for vine in best_new_vines(new) if new.size else ():
+        vines = np.array([condition.trial.vine for condition in conditions])
+        yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
 def exchanged(design: Sequence[int], allowed: NDArray[np.intp], worth: Criterion) -> list[int]:

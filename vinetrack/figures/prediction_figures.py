@@ -31,7 +31,7 @@ def draw_choice(choices: Sequence[Choice]) -> Figure:
     """Draw the films side by side: speed against diameter, and the certainty of the choice."""
     fig = st.new_figure(9.6, 4.4, layout=None)
     curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    films = [f"{1e6 * choice.thickness_m:g}" for choice in choices]
+    films = [f"{1e6 * choice.prediction.inputs.trial.thickness_m:g}" for choice in choices]
     for k, (choice, film) in enumerate(zip(choices, films, strict=True)):
         colour, marker = st.VINE_COLOURS[k % len(st.VINE_COLOURS)], st.VINE_MARKERS[k % len(st.VINE_MARKERS)]
         final, diameter_mm = choice.prediction.final, 1e3 * choice.prediction.inputs.trial.diameter_m

@@ -19,7 +19,7 @@ from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect, EffectError, catalogue, find_effect
+from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.experiment.schema import COLUMNS, CellError, option, read_range
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
@@ -51,6 +51,7 @@ from vinetrack.planning.predictive_inputs import (
     StatedValues,
     hoop_stress_Pa,
     predictive_inputs,
+    read_sizes,
 )
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json
 
@@ -124,32 +125,6 @@ def read_basis(
     model = planned.settings.model
     stated = StatedValues(**numbers, model=model, effects=names, sizes=sizes, user_effects=user_effects)
     return PredictionBasis(planned, stated, fit, heading)
-
-
-def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, tuple[float, float]]]:
-    """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
-    Returns name (of the effect), sizes (ends of a range by `effect.parameter`, equal for a fixed value).
-    """
-    name, _, sizes_text = text.partition("=")
-    effect = find_effect(name.strip(), further)
-    cells = [cell.strip() for cell in sizes_text.split(",")] if sizes_text.strip() else []
-    if len(cells) > len(effect.parameters):
-        known = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
-        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {known}.")
-    sizes = {}
-    for parameter, cell in zip(effect.parameters, cells, strict=False):
-        wrong = f"{parameter.name} of {effect.name} cannot be"
-        try:
-            ends = [float(part) for part in cell.split(":")]
-        except ValueError:
-            ends = []
-        if len(ends) not in (1, 2) or not all(map(math.isfinite, ends)):
-            raise EffectError(f"{wrong} {cell!r}: write a number, or a range such as 0.5:1.5.")
-        low, high = parameter.bounds
-        if min(ends) < low or max(ends) > high:
-            raise EffectError(f"{wrong} {cell}: it lies between {low:g} and {high:g}.")
-        sizes[f"{effect.name}.{parameter.name}"] = (min(ends), max(ends))
-    return effect.name, sizes
 
 
 def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
@@ -406,7 +381,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
-        yield str(remark("film_uncertain", um=1e6 * choices[0].thickness_m, odds=choices[0].odds))
+        yield str(remark("film_uncertain", um=1e6 * best.inputs.trial.thickness_m, odds=choices[0].odds))
     yield from (f"! {warning}" for warning in best.hazards)
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
 from vinetrack.dynamics.model import Model
@@ -47,8 +46,6 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
-SIZES = ("diameter_mm", "thickness_um", "length_mm")  # Columns by which vines differ (defined)
-
 
 @dataclass(frozen=True)
 class Condition:
@@ -67,7 +64,8 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
     used = [trial for trial in trials if trial.travel_ratio != 1]
     first = {trial.vine: k for k, trial in reversed(list(enumerate(trials))) if trial.travel_ratio != 1}
     models = [(trials[k], k) for k in sorted(first.values())]
-    stated = {column: values for column in SIZES if (values := _stated(limits, column)) is not None}
+    sizes = ("diameter_mm", "thickness_um", "length_mm")
+    stated = {column: values for column in sizes if (values := _stated(limits, column)) is not None}
     vines = [
         (trial, k, SAME_RIG)
         for trial, k in models
@@ -84,28 +82,11 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
                 continue
             for payload in _payloads(used, limits):
                 for pressure, sigma in _pressures(rig, payload, used, limits):
-                    settings: dict[str, Any] = {"pressure_Pa": pressure, "pressure_sigma_Pa": sigma}
                     name = f"next_{len(conditions) + 1}"
-                    trial = replace(rig, name=name, payload_kg=payload, **settings)
+                    trial = replace(rig, name=name, payload_kg=payload, pressure_Pa=pressure, pressure_sigma_Pa=sigma)
                     changed = _changed(trial, trials[like])
                     conditions.append(Condition(trial, like, max(effort, effort_of_vine), changed))
     return conditions
-
-
-def conditions_by_effort(
-    conditions: Sequence[Condition], best_new_vines: Callable[[NDArray[np.intp]], Sequence[str]]
-) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Yield the indices of the conditions to choose from with more and more effort: on the rig so far, with another
-    rig as well, and with one new vine at a time as well, of those that `best_new_vines` chooses among their indices.
-    """
-    efforts = np.array([condition.effort for condition in conditions])
-    for effort in (SAME_RIG, OTHER_RIG):
-        if (efforts == effort).any():
-            yield effort, np.flatnonzero(efforts <= effort)
-    new = np.flatnonzero(efforts == NEW_VINE)
-    for vine in best_new_vines(new) if new.size else ():
-        vines = np.array([condition.trial.vine for condition in conditions])
-        yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
 def _of(trial: Trial, column: str) -> float:
@@ -219,7 +200,7 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
         for length in _stated(limits, "length_mm") or [near.length_m]:
             size: dict[str, Any] = {"diameter_m": diameter, "thickness_m": wall, "length_m": length}
             sized = replace(near, video=None, track=None, pressure_trace=None, **size)
-            if all(_changed(sized, vine, SIZES) for vine in vines):
+            if all(_changed(sized, vine, ("diameter_mm", "thickness_um", "length_mm")) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
     most = 10  # New vines considered, at most (chosen)
     if len(new_vines) <= most:
@@ -332,23 +313,22 @@ def filming(fit: Fit) -> tuple[int, float]:
     return max(int(np.median([trial_data.n_rest for trial_data in data])), 3), 1.5 * float(max(moving_s))
 
 
-def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> tuple[Jobs, list[Any]]:
-    """Jobs and trajectories of trials that are released at time and position 0, see `_simulated`."""
+def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> list[tuple[Jobs, Trajectory | None]]:
+    """Job and trajectory of trials that are released at time and position 0, as the fit predicts them; None for those
+    that cannot be simulated, found by bisection.
+    """
+    if not blanks:
+        return []
     predictor, _, state = extended(fit, blanks)
     state.trial_effects[len(fit.trials) :] = 0.0
     jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
-    return jobs, _simulated(predictor, jobs)
-
-
-def _simulated(predictor: Predictor, jobs: Jobs) -> list[Any]:
-    """Trajectories of all jobs; None for those that cannot be simulated, found by bisection."""
     try:
-        return list(predictor.run(jobs))
+        return list(zip(jobs, predictor.run(jobs), strict=True))
     except SimulationError:
-        if len(jobs) == 1:
-            return [None]
-    middle = len(jobs) // 2
-    return _simulated(predictor, jobs[:middle]) + _simulated(predictor, jobs[middle:])
+        if len(blanks) == 1:
+            return [(jobs[0], None)]
+    middle = len(blanks) // 2
+    return _courses(fit, blanks[:middle]) + _courses(fit, blanks[middle:])
 
 
 def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[Condition, FitTrial]]:
@@ -356,6 +336,8 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     nears the end of the growth. Conditions that are not worth filming, or for which the last model is in doubt, are
     left out.
     """
+    if not conditions:
+        return []
     fit, (rest_frames, longest_s) = fits[-1], filming(fits[-1])
     grid_s = np.linspace(0.0, longest_s, 400)
     runs = [_courses(each, [(one, blank_film(fit, one, grid_s)) for one in conditions]) for each in fits]
@@ -369,13 +351,13 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     # 1.05: the ratio above which the model predicts compression in the tail (chosen)
     largest_ratio = max(1.05, *filter(math.isfinite, seen))
     blanks = []
-    for condition, job, *moved in zip(conditions, runs[-1][0], *(run for _, run in runs), strict=True):
-        trial, moving = condition.trial, [course for course in moved if course is not None]
+    for condition, *courses in zip(conditions, *runs, strict=True):
+        trial, moving = condition.trial, [moved for _, moved in courses if moved is not None]
         if len(moving) < len(fits):
             continue
         near_s = _near_end_s(trial, moving)
         grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
-        ratio = _speed_ratio(fit, trial, job, moving[-1].tail_velocity_m_s)
+        ratio = _speed_ratio(fit, trial, courses[-1][0], moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = (
             grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * fit.predictor.frames_s[condition.like]
@@ -383,11 +365,13 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
         if grows_enough and (trial.tail_slack == "free" or ratio <= largest_ratio):
             # Once more on a grid that ends soon after the growth
             blanks.append((condition, blank_film(fit, condition, np.linspace(0.0, near_s + grid_s[1], grid_s.size))))
-    runs = [_courses(each, blanks) for each in fits] if blanks else []
-    return [
-        (condition, _film(fit, condition, _near_end_s(condition.trial, moved), moved[0], rest_frames))
-        for (condition, _), *moved in zip(blanks, *(run for _, run in runs), strict=True)
-    ]
+    films = []
+    for (condition, _), *courses in zip(blanks, *(_courses(each, blanks) for each in fits), strict=True):
+        moving = [moved for _, moved in courses if moved is not None]
+        if len(moving) == len(fits):
+            near_s = _near_end_s(condition.trial, moving)
+            films.append((condition, _film(fit, condition, near_s, moving[0], rest_frames)))
+    return films
 
 
 def _near_end_s(trial: Trial, courses: Sequence[Trajectory]) -> float:

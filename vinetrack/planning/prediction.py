@@ -85,8 +85,6 @@ CURVE_COLUMNS = (
     "tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa",
 )  # fmt: skip
 
-WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
-
 TIME = "time to get there"
 EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
@@ -141,6 +139,7 @@ class VinePrediction:
         return (*self._hazards(), *self.inputs.notes)
 
     def _hazards(self) -> Iterator[Remark]:
+        warned_from = 0.05  # Fraction of draws above which a hazard is reported (chosen)
         inputs, trial = self.inputs, self.inputs.trial
         stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
         if stress > 0.9 * BURST_STRESS_PA:
@@ -150,11 +149,11 @@ class VinePrediction:
         low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
         if median >= trial.pressure_Pa / 1e3:
             yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
-        elif self.arrives < 1 - WARNING_FRACTION:
+        elif self.arrives < 1 - warned_from:
             yield remark("stalls", share=1 - self.arrives)
-        if self.slack >= WARNING_FRACTION and trial.tail_slack == "free":
+        if self.slack >= warned_from and trial.tail_slack == "free":
             yield remark("goes_slack", share=self.slack)
-        elif self.slack >= WARNING_FRACTION:
+        elif self.slack >= warned_from:
             tension, has_payload = self[LEAST_TENSION], trial.payload_kg > 0
             facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
             yield remark("tail_compressed", share=self.slack, **facts)
@@ -370,7 +369,6 @@ class Choice:
     `others` has columns diameter, m, and lead speed, m/s, of the fastest vine of every diameter of the first round.
     """
 
-    thickness_m: float
     prediction: VinePrediction
     limits: tuple[str, ...]
     odds: float
@@ -393,7 +391,6 @@ def fastest(
     fastest_of_draw = np.argmax(drawn, axis=0)
     choices = [
         Choice(
-            thickness_m=inputs.trial.thickness_m,
             prediction=predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
             limits=_limits(room, inputs.trial),
             odds=float(np.mean(fastest_of_draw == k)),

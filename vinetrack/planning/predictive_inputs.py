@@ -22,7 +22,7 @@ from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import convert, number
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find_effect
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
@@ -111,8 +111,6 @@ PRESSURE, YIELD = "pressure_Pa", "yield_pressure_Pa"
 
 BAND = (0.05, 0.5, 0.95)  # Convention: median and 90 % band of a prediction
 
-Draws = dict[str, Floats]  # Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure
-
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -164,8 +162,8 @@ class PredictiveInputs:
         values = dict(zip(self.model.parameter_names, self.model.parameters_of(self.trial).tolist(), strict=True))
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
-    def draw(self, count: int, seed: int, only: Collection[str] | None = None) -> Draws:
-        """Draw every input `count` times within its physical bounds; the same seed gives the same draws."""
+    def draw(self, count: int, seed: int, only: Collection[str] | None = None) -> dict[str, Floats]:
+        """Draw every input `count` times within its physical bounds, by name; the same seed gives the same draws."""
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for one in self.uncertainties:
             if only is None or one.name in only:
@@ -201,6 +199,32 @@ def _parameters(model: Model) -> list[tuple[str, Effect, Parameter]]:
     return [
         (f"{effect.name}.{parameter.name}", effect, parameter) for effect in model for parameter in effect.parameters
     ]
+
+
+def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, tuple[float, float]]]:
+    """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
+    Returns name (of the effect), sizes (ends of a range by `effect.parameter`, equal for a fixed value).
+    """
+    name, _, sizes_text = text.partition("=")
+    effect = find_effect(name.strip(), further)
+    cells = [cell.strip() for cell in sizes_text.split(",")] if sizes_text.strip() else []
+    if len(cells) > len(effect.parameters):
+        known = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
+        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {known}.")
+    sizes = {}
+    for parameter, cell in zip(effect.parameters, cells, strict=False):
+        wrong = f"{parameter.name} of {effect.name} cannot be"
+        try:
+            ends = [float(part) for part in cell.split(":")]
+        except ValueError:
+            ends = []
+        if len(ends) not in (1, 2) or not all(map(math.isfinite, ends)):
+            raise EffectError(f"{wrong} {cell!r}: write a number, or a range such as 0.5:1.5.")
+        low, high = parameter.bounds
+        if min(ends) < low or max(ends) > high:
+            raise EffectError(f"{wrong} {cell}: it lies between {low:g} and {high:g}.")
+        sizes[f"{effect.name}.{parameter.name}"] = (min(ends), max(ends))
+    return effect.name, sizes
 
 
 # ------------------------------------------------------------------------------
