@@ -404,7 +404,10 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     fit = fit_edges(strip, state, informative_frames(state.edge))
     for iteration in range(3 * rounds):
         before = fit[:, 0]
-        state = _update_state(strip, state, fit, exposure)
+        # Take over the fitted edges; blur lengths, film and background follow from them.
+        edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
+        state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
+        state = estimate_appearance(strip, state, 4 * strip.noise + 4)
         informative = informative_frames(state.edge)
         if iteration == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
@@ -586,13 +589,6 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, state.appearance, width, evidence_clip)
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
-
-
-def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
-    """Take over the fitted edges; re-estimate blur lengths, film and background."""
-    edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
-    state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
-    return estimate_appearance(strip, state, 4 * strip.noise + 4)
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
