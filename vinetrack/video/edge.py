@@ -600,7 +600,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # 100.0: upper limit of a frame's misfit relative to the median (chosen)
     misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
-    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * misfit_ratio, ASTRAY_PX)
+    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * np.sqrt(misfit_ratio), ASTRAY_PX)
     # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
     acceleration = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(acceleration, -50, 50) * exposure**2 / 24
