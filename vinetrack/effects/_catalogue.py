@@ -92,8 +92,7 @@ class EffectError(UserError, ValueError):
 
 
 # What an effect may import. It is one file, so that the hash of its text stands for it wherever it lies.
-_STANDARD = "__future__ collections dataclasses functools itertools math typing"
-_IMPORTED = {*_STANDARD.split(), "numba", "numpy", "scipy", "vinetrack"}
+_IMPORTED = "__future__ collections dataclasses functools itertools math numba numpy scipy typing vinetrack"
 
 
 def _load_module(path: Path) -> ModuleType:
@@ -108,8 +107,8 @@ def _load_module(path: Path) -> ModuleType:
         imports = [node.names for node in ast.walk(tree) if isinstance(node, ast.Import)]
         imported = {alias.name.split(".")[0] for names in imports for alias in names}
         imported |= {(n.module or ".").split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-        if foreign := sorted(imported - _IMPORTED):
-            known = ", ".join(sorted(_IMPORTED - {"__future__"}))
+        if foreign := sorted(imported.difference(_IMPORTED.split())):
+            known = ", ".join(_IMPORTED.split()[1:])
             raise EffectError(f"{path}: imports {', '.join(foreign)}, but an effect may only import {known}.")
         module = ModuleType(name)
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)

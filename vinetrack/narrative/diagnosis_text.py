@@ -9,17 +9,10 @@ from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core import units
 from vinetrack.core.problems import joined
 from vinetrack.core.terminal import html_table
-from vinetrack.core.units import (
-    PREDICTION_UNITS,
-    decimals,
-    display_unit,
-    number,
-    pressure_text,
-    with_error,
-    with_interval,
-)
+from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
 from vinetrack.diagnosis.result import (
     EXPECTED,
     NOT_TESTABLE,
@@ -189,8 +182,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         alike = list(group)
         new = ["a new vine"] if trial["new_vine"] else []
         new += [f"{(c := COLUMNS[name]).quantity} {trial.get(name, math.nan):g} {c.unit}" for name in trial["changed"]]
-        pressure, payload = _pressure_of(trial), f"{trial.get('payload_g', 0.0):g}"
-        then = percent(alike[-1]["probability"])
+        pressure = pressure_text(1e3 * trial["pressure_kPa"], trial["pressure_unit"])
+        payload, then = f"{trial.get('payload_g', 0.0):g}", percent(alike[-1]["probability"])
         rows.append((str(len(alike)), trial["vine"], pressure, payload, ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
@@ -228,17 +221,13 @@ def measurement_text(effects: Sequence[Effect]) -> str:
     return " ".join(f"{name}: {words[0].lower()}{words[1:]}" for name, words in told if words)
 
 
-def _pressure_of(trial: Mapping[str, Any]) -> str:
-    return pressure_text(1e3 * trial["pressure_kPa"], trial.get("pressure_unit", "kPa"))
-
-
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     """Return the trials to make, as a list within a sentence."""
     told = []
     for trial in trials:
-        words = f"{_count(trial['replicates'], 'trial')} at {_pressure_of(trial)}"
-        if trial["payload_g"]:
-            words += f" with {trial['payload_g']:.3g} g"
+        pressure_Pa, unit = 1e3 * trial["pressure_kPa"], trial.get("pressure_unit", "kPa")
+        condition = _condition_text(pressure_Pa, unit, trial["payload_g"] / 1e3 or None)
+        words = f"{_count(trial['replicates'], 'trial')} at {condition}"
         size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
         words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
         changed = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in trial["changed"]]
@@ -672,7 +661,7 @@ def _size_text(trial: Trial) -> str:
 
 def value_in_unit(value: float, unit: str) -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
-    return "never" if math.isinf(value) else number(value * display_unit(unit, PREDICTION_UNITS)[1])
+    return "never" if math.isinf(value) else number(value * display_unit(unit, units.PREDICTION_UNITS)[1])
 
 
 def speed_band_text(share: Band) -> str:
@@ -690,8 +679,7 @@ def _of_draws(share: float) -> str:
 
 def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
     """Names of numbers and sizes of their changes, in display units."""
-    shown = ((name, size, *display_unit(unit)) for name, size, unit in changes)
-    return [(name, f"{size * factor:.2g} {unit}".rstrip()) for name, size, unit, factor in shown]
+    return [(name, f"{size * by:.2g} {u}".rstrip()) for name, size, unit in changes for u, by in [display_unit(unit)]]
 
 
 def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -> str:
