@@ -54,10 +54,14 @@ def place_of(questions, name: str) -> int:
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     design = planned(2, noise_m=1e-3)
     promised = planned_tests(*design)[0].fit
-    pairs = campaign_power.filmed_again(promised, np.random.default_rng(0))
-    filmed = vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0), profile=False)
-    assert [n.sigma for n in promised.numbers] == pytest.approx([n.sigma for n in filmed.numbers], rel=0.04)
-    precisions = [fit.solution.problem.release_origin_precision for fit in (promised, filmed)]
+    filmed = [
+        vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0), profile=False)
+        for pairs in (campaign_power.filmed_again(promised, np.random.default_rng(seed)) for seed in range(12))
+    ]
+    sigmas = np.median([[number.sigma for number in fit.numbers] for fit in filmed], axis=0)
+    # What single campaigns state scatters by 13 and 29 %, the median of twelve by half of the tolerance at most.
+    assert [number.sigma for number in promised.numbers] == pytest.approx(sigmas, rel=0.2)
+    precisions = [fit.solution.problem.release_origin_precision for fit in (promised, filmed[0])]
     assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
 
 
