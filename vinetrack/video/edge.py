@@ -209,11 +209,10 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
-# Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
-# edge is a guess (chosen)
+# Misfit, in units of the noise, above which an object stands in front of the tip (chosen)
 HIDDEN_MISFIT = 3.2
 # Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
-UNUSUAL_MISFIT_RATIO = 2.0
+UNUSUAL_MISFIT_RATIO = 2.4
 # Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
 # visible (chosen)
 LEAST_AMPLITUDE = 0.6
@@ -313,19 +312,15 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     """
     near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
-    large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
-    # 1.12: ratio above which nothing of the tip is visible, whatever its contrast (chosen)
-    no_edge = (misfit > 1.12 * HIDDEN_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
-    covered = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & no_edge
+    unusual = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > HIDDEN_MISFIT / 2)
+    covered = unusual & ((misfit > HIDDEN_MISFIT) | (amplitude < LEAST_AMPLITUDE))
+    # 0.75: amplitude below which part of the edge is hidden (chosen)
+    guessed = unusual & (amplitude < 0.75)
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
         added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
-    unlike_model = large & (misfit_ratio > HIDDEN_MISFIT)
-    # 0.75: amplitude below which part of the edge is hidden (chosen)
-    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < 0.75)
-    guessed = near & (unlike_model | partly_hidden)
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
