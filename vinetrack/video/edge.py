@@ -210,7 +210,7 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
 # Misfit, in units of the noise, above which an object stands in front of the tip (chosen)
-HIDDEN_MISFIT = 3.2
+HIDDEN_MISFIT = 4.0
 # Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
 UNUSUAL_MISFIT_RATIO = 2.4
 # Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
@@ -312,9 +312,9 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     """
     near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
-    unusual = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > HIDDEN_MISFIT / 2)
+    # 1.6, 0.75: misfit above which, and amplitude below which, part of the edge is hidden (chosen)
+    unusual = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
     covered = unusual & ((misfit > HIDDEN_MISFIT) | (amplitude < LEAST_AMPLITUDE))
-    # 0.75: amplitude below which part of the edge is hidden (chosen)
     guessed = unusual & (amplitude < 0.75)
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
