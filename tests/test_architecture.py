@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (683, 3, 8),
     "experiment": (1678, 5, 17),
     "figures": (2277, 8, 37),
-    "inference": (6242, 14, 59),
+    "inference": (6292, 14, 59),
     "interface": (619, 2, 2),
     "kinematics": (1738, 6, 12),
     "laboratory": (1600, 6, 9),
