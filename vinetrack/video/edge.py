@@ -210,7 +210,7 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
 # Misfit, in units of the noise, above which an object stands in front of the tip (chosen)
-HIDDEN_MISFIT = 4.0
+HIDDEN_MISFIT = 3.6
 # Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
 UNUSUAL_MISFIT_RATIO = 2.4
 # Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
