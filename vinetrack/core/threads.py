@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, TypeVar
-
-Part = TypeVar("Part")
+from typing import Any
 
 
 def available_cores() -> int:

@@ -587,7 +587,7 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
-    """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
+    """Add to a converged fit the errors of bands, start and doors, and refer the edge to mid-exposure."""
     from scipy.ndimage import median_filter
 
     core = core_frames(state, fit)
