@@ -14,10 +14,9 @@ from vinetrack import effects
 from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, evaluate, measured_motion
-from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import check_needs, effects_on, host_for, shared_host, stated
-from vinetrack.dynamics.simulate import SimulationError, prepare, simulate_many
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load_effect, own_effects
+from vinetrack.dynamics.simulate import SimulationError, simulate_many
+from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue, load_effect, own_effects
 
 SLOWER = LOADED.trial(pressure_Pa=14e3)
 VINE = replace(SLOWER, payload_kg=0.0)
@@ -250,20 +249,6 @@ def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp
     models = (vt.base_model(), vt.make_model(["gravity"]), vt.base_model() + "air_drag" + own[NAME])
     for several in (*(model.effects for model in models), (*vt.base_model().effects, named_as_another)):
         assert shared_host(several) is None
-
-
-def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monkeypatch):
-    asked: list[tuple[int, bool]] = []
-
-    def noted(effects: tuple[Effect, ...], tail_free: bool):
-        asked.append((len(effects), tail_free))
-        return kernel(vt.base_model().effects)
-
-    monkeypatch.setattr(batch, "kernel", noted)
-    model = vt.base_model().with_values({"eversion_damping.B": BARE.B}) + "air_drag"
-    for slack in ("taut", "free"):
-        prepare(model, [replace(BARE.trial(), tail_slack=slack)], [np.linspace(0.0, 0.1, 5)])
-    assert asked == [(len(catalogue()) + 1, False), (len(model.effects), True)]
 
 
 def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):

@@ -27,7 +27,6 @@ from vinetrack.diagnosis.candidate_fits import (
     drop_curves,
     with_curves,
 )
-from vinetrack.diagnosis.ladder import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -423,11 +422,11 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     report("letting the tail go slack")
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     try:
-        slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
+        slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
         after = refit(slack, thorough=False, afresh=has_excess_scatter(fit))
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-    return likelihood_ratio(fit, (TAIL_SLACK,), with_host(after, fit.predictor.host))
+    return likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
 MAX_BACKWARD_STEPS = 2  # Times that a search over sets goes on from a smaller set (chosen)

@@ -6,17 +6,15 @@ inlined. Unless stated they take `(time, x, v, chamber, trial)`: x, v are positi
 `chamber` is the gauge pressure of the chamber, Pa.
 
 rates               acceleration of the tail, m/s², and rate of change of the chamber's pressure, Pa/s
-rest_acceleration   of a vine at rest (no v), including the forces that hold it
 observed            position of the leading edge that the camera reports, m
 first_chamber       pressure of the chamber at release, of (trial) alone
 has_chamber         whether an effect gives the chamber an equation of its own, of no argument
 row_delay           how much later rows are read by the metre, s/m, of (trial) alone
 averaged_over       square of the time that positions are averaged over, s², of (trial) alone
-tip_tension         tension left for the tail, N, and rate of the chamber; one more argument, whether it rests
-free_fall           acceleration of a slack tail, m/s², of (time, y, ẏ, x, v, chamber, trial)
+ask                 another quantity, and the rate of the chamber, of (what, time, y, ẏ, x, v, chamber, trial)
 
-The last two are there where tails may go slack. So are `slack_fraction`, `slack_at_rest` and `follow_slack` of
-`vinetrack.dynamics.integrator`; elsewhere they are `_never_slack`, `_not_slack_at_rest` and `_no_slack_phase` below.
+A model takes long to compile, so that it stands in the compiled code twice: in the steps, where a call would cost half
+as much again, and in `ask`.
 
 The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
 """
@@ -69,22 +67,14 @@ class BatchArrays(NamedTuple):
     stops: Floats  #: tail travel at the end of growth, m, shape (n_trials,); infinite if there is none
 
 
-RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
+RUNNING, ENDED, STALLED, TOO_HARD, TAUT = np.arange(5)  # Status of a trajectory
 
 
-@inlined
-def _never_slack(equations, trial, h, start, end):  # noqa: ARG001
-    return 2.0  # beyond the end of every step
-
-
-@inlined
-def _not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
-    return False
-
-
-@inlined
-def _no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
-    return TAUT, row, start, 0.0
+# What can be asked of a model: the acceleration of the tail, m/s²; that of a vine at rest, including the forces that
+# hold it; the tension that its tip leaves for the tail, N, moving and at rest; the acceleration of a slack tail, m/s²;
+# the position that the camera reports, m. Numba compiles a function anew for every integer of Python's that it is
+# called with, but only once for all of numpy's.
+ACCELERATION, REST_ACCELERATION, TENSION, REST_TENSION, FREE_FALL, SEEN = np.arange(6)
 
 
 class Point(NamedTuple):
@@ -194,14 +184,6 @@ def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
 
 
 @inlined
-def _speed_derivative(equations, trial, time, x, v, chamber, acceleration, scale):
-    """∂a/∂v, 1/s, by a one-sided difference towards higher speed, since a different law holds at rest."""
-    delta = 1e-6 * max(abs(v), 1e-4 * scale)
-    higher, _rate = equations.rates(time, x, v + delta, chamber, trial)
-    return (higher - acceleration) / delta
-
-
-@inlined
 def starting_values(point, h, previous):
     """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated. Without a
     previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the speed at
@@ -261,8 +243,7 @@ def radau_step(equations, trial, point, stages, scale, rtol):
     """One step from `point`, with the size and the starting values in `stages`."""
     time, x, v, _acceleration, chamber = point
     h, z1, z2, z3 = stages
-    j1 = j2 = j3 = 0.0
-    g1 = g2 = g3 = 0.0
+    j1 = j2 = j3 = f1 = f2 = f3 = g1 = g2 = g3 = 0.0
     tolerance = 1e-2 * rtol * max(scale, abs(v))
     fast = 0.1  # contraction of the changes below which the Jacobian is kept
     previous_size = 1e300
@@ -277,20 +258,42 @@ def radau_step(equations, trial, point, stages, scale, rtol):
         x2 = x + h * (C[1] * v + A[1][0] * z1 + A[1][1] * z2 + A[1][2] * z3)
         x3 = x + h * (v + A[2][0] * z1 + A[2][1] * z2 + A[2][2] * z3)
         t1, t2, t3 = time + C[0] * h, time + C[1] * h, time + h
-        f1, g1 = equations.rates(t1, x1, v1, q1, trial)
-        f2, g2 = equations.rates(t2, x2, v2, q2, trial)
-        f3, g3 = equations.rates(t3, x3, v3, q3, trial)
-        if not jacobian_current:
-            j1 = _speed_derivative(equations, trial, t1, x1, v1, q1, f1, scale)
-            j2 = _speed_derivative(equations, trial, t2, x2, v2, q2, f2, scale)
-            j3 = _speed_derivative(equations, trial, t3, x3, v3, q3, f3, scale)
-            jacobian_current = True
-            # The equation of a chamber is stiff if its supply is fast.
-            chamber_active = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
-            if chamber_active:
-                dq = 1e-6 * (abs(q3) + 1e3)
-                _f, higher = equations.rates(t3, x3, v3, q3 + dq, trial)
-                jc = h * (higher - g3) / dq
+        # One loop with one call, for the model to be compiled into it once: the rates at the three stages and, for a
+        # new Jacobian, at a slightly higher speed each and at a slightly higher pressure of the chamber.
+        for k in range(3 if jacobian_current else 7):
+            t, x_stage, v_stage, q = t3, x3, v3, q3
+            if k in (0, 3):
+                t, x_stage, v_stage, q = t1, x1, v1, q1
+            elif k in (1, 4):
+                t, x_stage, v_stage, q = t2, x2, v2, q2
+            delta = 0.0
+            if k == 6:
+                # The equation of a chamber is stiff if its supply is fast.
+                chamber_active = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
+                if not chamber_active:
+                    break
+                delta = 1e-6 * (abs(q3) + 1e3)
+                q += delta
+            elif k >= 3:
+                # One-sided, towards higher speed, since a different law holds at rest
+                delta = 1e-6 * max(abs(v_stage), 1e-4 * scale)
+                v_stage += delta
+            f, g = equations.rates(t, x_stage, v_stage, q, trial)
+            if k == 0:
+                f1, g1 = f, g
+            elif k == 1:
+                f2, g2 = f, g
+            elif k == 2:
+                f3, g3 = f, g
+            elif k == 3:
+                j1 = (f - f1) / delta
+            elif k == 4:
+                j2 = (f - f2) / delta
+            elif k == 5:
+                j3 = (f - f3) / delta
+            else:
+                jc = h * (g - g3) / delta
+        jacobian_current = True
         change = 0.0
         if chamber_active:
             c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)

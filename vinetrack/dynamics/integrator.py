@@ -17,11 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from vinetrack.dynamics.equations import (
+    ACCELERATION,
     ENDED,
+    FREE_FALL,
     NO_STAGES,
+    REST_ACCELERATION,
+    REST_TENSION,
     RUNNING,
     STALLED,
     TAUT,
+    TENSION,
     TOO_HARD,
     Point,
     TrialArrays,
@@ -60,9 +65,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     while True:
         if phase == slack:
             slack_time = point.time if np.isnan(slack_time) else slack_time
-            status, row, point, end_speed = equations.follow_slack(
-                equations, trial, times, row, point, stop, rtol, out, work
-            )
+            status, row, point, end_speed = _follow_slack(equations, trial, times, row, point, stop, rtol, out, work)
             if status == ENDED:
                 _write_at_rest(equations, trial, times, row, np.inf, _at_position(point, stop), out)
             if status != TAUT:
@@ -82,7 +85,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 if row == count:
                     return STALLED, point.time, 0.0, n_steps, slack_time
                 point = Point(start, point.x, 0.0, 0.0, chamber)
-            if equations.slack_at_rest(equations, trial, point.time, point.x, point.chamber):
+            if trial.inputs[FREE] > 0 and _slack_at_rest(equations, trial, point.time, point.x, point.chamber):
                 point = Point(point.time, point.x, 0.0, 0.0, point.chamber)
                 phase = slack
                 continue
@@ -118,7 +121,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             continue
         ended = end.x >= stop
         fraction = _fraction_at(stop, h, point, end) if ended else 1.0
-        slack_fraction = equations.slack_fraction(equations, trial, h, point, end)
+        slack_fraction = _slack_fraction(equations, trial, h, point, end) if trial.inputs[FREE] > 0 else 2.0
         if slack_fraction < 2 and (slack_fraction < fraction or not ended):
             if not slack_located:
                 # The chamber pressure is less accurate within a step than at its ends, so a step is ended here.
@@ -174,18 +177,19 @@ def integrate_trials(equations, batch, first, last, rtol, out, ends, work, means
         ends[i, 4] = slack_time
 
 
-@compiled
+@inlined
 def _rates(equations, time, x, v, chamber, trial):
-    """`equations.rates` for callers outside the steps, compiled once instead of into each of them. With
-    `_rest_acceleration` this saves a tenth of the time to compile the whole catalogue.
-    """
-    return equations.rates(time, x, v, chamber, trial)
+    """`equations.rates` for callers outside the steps."""
+    r, x, v = trial.inputs[RATIO], max(x, 0.0), max(v, 0.0)
+    return equations.ask(ACCELERATION, time, x / r, v / r, x, v, chamber, trial)
 
 
-@compiled
+@inlined
 def _rest_acceleration(equations, time, x, chamber, trial):
-    """`equations.rest_acceleration`, compiled once."""
-    return equations.rest_acceleration(time, x, chamber, trial)
+    """Acceleration of the tail of a vine at rest, m/s², including the forces that hold it."""
+    x = max(x, 0.0)
+    acceleration, _rate = equations.ask(REST_ACCELERATION, time, x / trial.inputs[RATIO], 0.0, x, 0.0, chamber, trial)
+    return acceleration
 
 
 @inlined
@@ -383,6 +387,9 @@ DENSE_WEIGHTS = (
 )  # fmt: skip
 
 
+_X, _V, _Y, _CHAMBER = np.arange(4)  # Places in a row of rates
+
+
 class SlackState(NamedTuple):
     """State with a slack tail: position and speed of the tail, position of the tip, chamber pressure, SI."""
 
@@ -392,27 +399,24 @@ class SlackState(NamedTuple):
     chamber: float
 
 
-@compiled
-def _tip_tension(equations, time, x, v, chamber, resting, trial):
-    """`equations.tip_tension`, compiled once instead of into each of its nine callers."""
-    return equations.tip_tension(time, x, v, chamber, resting, trial)
+@inlined
+def _tip_tension(equations, what, time, x, v, chamber, trial):
+    """The tension that the tip leaves for the tail, N, moving or at rest, and the rate of the chamber."""
+    r, x, v = trial.inputs[RATIO], max(x, 0.0), max(v, 0.0)
+    return equations.ask(what, time, x / r, v / r, x, v, chamber, trial)
 
 
 @compiled
-def slack_at_rest(equations, trial, time, x, chamber):
+def _slack_at_rest(equations, trial, time, x, chamber):
     """Whether the tail of a vine at rest would be under compression."""
-    if trial.inputs[FREE] <= 0:
-        return False
-    tension, _rate = _tip_tension(equations, time, x, 0.0, chamber, True, trial)
+    tension, _rate = _tip_tension(equations, REST_TENSION, time, x, 0.0, chamber, trial)
     return tension < 0
 
 
 @compiled
-def slack_fraction(equations, trial, h, start, end):
+def _slack_fraction(equations, trial, h, start, end):
     """Fraction of a step at which the tail's tension falls to zero, by bisection."""
-    if trial.inputs[FREE] <= 0:
-        return 2.0
-    tension, _rate = _tip_tension(equations, end.time, end.x, end.v, end.chamber, False, trial)
+    tension, _rate = _tip_tension(equations, TENSION, end.time, end.x, end.v, end.chamber, trial)
     if tension >= 0:
         return 2.0
     low, high = 0.0, 1.0
@@ -420,7 +424,7 @@ def slack_fraction(equations, trial, h, start, end):
         middle = 0.5 * (low + high)
         x, v, _a = quintic(middle, h, start, end)
         pressure = start.chamber + middle * (end.chamber - start.chamber)
-        tension, _rate = _tip_tension(equations, start.time + middle * h, x, v, pressure, False, trial)
+        tension, _rate = _tip_tension(equations, TENSION, start.time + middle * h, x, v, pressure, trial)
         if tension < 0:
             high = middle
         else:
@@ -431,20 +435,20 @@ def slack_fraction(equations, trial, h, start, end):
 @compiled
 def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
     """Tail speed r·ẏ at a tip without tension, at which its forces balance, by the Illinois method; x = r·y."""
-    f_low, _r = _tip_tension(equations, time, x, 0.0, chamber, not moving, trial)
+    f_low, _r = _tip_tension(equations, TENSION if moving else REST_TENSION, time, x, 0.0, chamber, trial)
     if f_low <= 0:
         return 0.0
     low, high = 0.0, max(guess, 1e-6)
-    f_high, _r = _tip_tension(equations, time, x, high, chamber, False, trial)
+    f_high, _r = _tip_tension(equations, TENSION, time, x, high, chamber, trial)
     factor = 1.01
     while f_high > 0 and high < 1e6:
         low, f_low = high, f_high
         high *= factor
         factor = min(factor * factor, 10.0)
-        f_high, _r = _tip_tension(equations, time, x, high, chamber, False, trial)
+        f_high, _r = _tip_tension(equations, TENSION, time, x, high, chamber, trial)
     if low == 0.0 and guess > 0:
         near = 0.99 * guess
-        f_near, _r = _tip_tension(equations, time, x, near, chamber, False, trial)
+        f_near, _r = _tip_tension(equations, TENSION, time, x, near, chamber, trial)
         if f_near > 0:
             low, f_low = near, f_near
         else:
@@ -455,7 +459,7 @@ def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
         middle = high - f_high * (high - low) / (f_high - f_low)
         if not low < middle < high:
             middle = 0.5 * (low + high)
-        f, _r = _tip_tension(equations, time, x, middle, chamber, False, trial)
+        f, _r = _tip_tension(equations, TENSION, time, x, middle, chamber, trial)
         if f * f_high < 0:
             low, f_low = high, f_high
         else:
@@ -471,8 +475,8 @@ def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
     """Write the rates of a `SlackState` into `rates`, shape (4,); return the tail speed of the film at the tip, m/s."""
     r = trial.inputs[RATIO]
     u = _free_tip_speed(equations, trial, time, r * s.y, s.chamber, tip_speed, moving)
-    _tension, chamber_rate = _tip_tension(equations, time, r * s.y, u, s.chamber, False, trial)
-    fall = equations.free_fall(time, s.y, u / r, s.x, s.v, s.chamber, trial)
+    _tension, chamber_rate = _tip_tension(equations, TENSION, time, r * s.y, u, s.chamber, trial)
+    fall, _rate = equations.ask(FREE_FALL, time, s.y, u / r, s.x, s.v, s.chamber, trial)
     rates[0] = s.v
     rates[1] = 0.0 if s.v <= 0 and fall < 0 else fall
     rates[2] = u / r
@@ -512,10 +516,10 @@ def _dormand_prince(equations, trial, time, s, h, tip_speed, k):
 def _slack_at(part, h, s, end, k):
     """The state at the fraction `part` of a step."""
     return SlackState(
-        _dense(part, h, s.x, end.x, k, 0),
-        _dense(part, h, s.v, end.v, k, 1),
-        _dense(part, h, s.y, end.y, k, 2),
-        _dense(part, h, s.chamber, end.chamber, k, 3),
+        _dense(part, h, s.x, end.x, k, _X),
+        _dense(part, h, s.v, end.v, k, _V),
+        _dense(part, h, s.y, end.y, k, _Y),
+        _dense(part, h, s.chamber, end.chamber, k, _CHAMBER),
     )
 
 
@@ -562,7 +566,7 @@ def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, 
 
 
 @compiled
-def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
+def _follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
     """Integrate a slack phase until the tail is taut again, growth ends or the last time is reached."""
     time, until = start.time, times[times.size - 1]
     r = trial.inputs[RATIO]

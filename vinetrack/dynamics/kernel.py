@@ -41,7 +41,7 @@ _STATE = (
 )
 
 
-def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
+def sum_source(effects: Sequence[Effect]) -> str:
     """Source of the module with the functions of this sum of effects: see `vinetrack.dynamics.equations`."""
     model = Model(tuple(effects))
     loads: dict[str, str] = {}
@@ -59,10 +59,12 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             lines += [f"if {condition}:", f"    {assign} {name}({state}, rig{arguments})"]
         return ("\n" + " " * indent).join(lines)
 
-    def function(name: str, arguments: str, motion: str, *body: str, at_release: bool = False) -> str:
+    def function(
+        name: str, arguments: str, motion: str, *body: str, at_release: bool = False, how: str = "inlined"
+    ) -> str:
         lines = "\n    ".join(body)
         return f"""
-@inlined
+@{how}
 def {name}({arguments}):
     on, theta = trial.on, trial.theta
     rig = TrialInputs({", ".join(f"trial.inputs[{i}]" for i in range(len(TrialInputs._fields)))})
@@ -112,44 +114,43 @@ def {name}({arguments}):
     mass = max(film_mass + max(added, 0.0), rig.least_mass)
     mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"""
     added = added if model.hooks["added_mass"] else ""
-    # Without an effect that changes the position that the camera reports, it is that of the edge.
-    acting = " or ".join(f"on[{i}]" for i in sorted(i for i, _, _ in model.hooks["observed_position"]))
-    seen = f"""if not ({acting}):
-        return seen
-    {terms}
-    tension = max(tip, 0.0) / rig.travel_ratio
-    {calls("observed_position", "seen =")}"""
     # The rate of the chamber depends on its own pressure, not on that at the tip.
     chamber = calls("chamber_rate", "chamber_rate +=", state=_STATE.replace(" pressure,", " chamber,"))
-    no_compression = "if rig.tail_free > 0: tip = max(tip, 0.0)" if tail_free else ""
-    acceleration = "return (tip / rig.travel_ratio + tail) / mass"
+    acceleration = "return (tip / rig.travel_ratio + tail) / mass, chamber_rate"
     moving = "x, v = max(x, 0.0), max(v, 0.0)\n    y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"
-    at_rest = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
     released = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
-    gauge, held = calls("gauge", "pressure ="), calls("rest_force", "tip +=")
+    gauge, held = calls("gauge", "pressure ="), calls("rest_force", "tip +=", 8) or "pass"
+    seen = f"""tension = max(tip, 0.0) / rig.travel_ratio
+        {calls("observed_position", "seen =", 8)}"""
+    asked = f"""if what == SEEN:
+        {seen}
+        return seen, 0.0
+    if what == REST_ACCELERATION or what == REST_TENSION:
+        {held}
+    {chamber}
+    if what == FREE_FALL:
+        return tail / mass, chamber_rate
+    if what == TENSION or what == REST_TENSION:
+        return tip / rig.travel_ratio, chamber_rate
+    if what == REST_ACCELERATION and rig.tail_free > 0:
+        tip = max(tip, 0.0)
+    {added}
+    {acceleration}"""
+    # Without an effect that changes the position that the camera reports, it is that of the edge.
+    acting = " or ".join(f"on[{i}]" for i in sorted(i for i, _, _ in model.hooks["observed_position"]))
+    seen = f"""if {acting or "False"}:
+        seen, chamber_rate = ask(SEEN, time, y, ydot, x, v, chamber, trial)
+    return seen"""
     functions = [
-        function("rates", "time, x, v, chamber, trial", moving, terms, chamber, added, f"{acceleration}, chamber_rate"),
-        function(
-            "rest_acceleration", "time, x, chamber, trial", at_rest, terms, held, no_compression, added, acceleration
-        ),
-        function("observed", "time, x, v, chamber, trial", moving, seen if acting else "", "return seen"),
+        function("rates", "time, x, v, chamber, trial", moving, terms, chamber, added, acceleration),
+        function("ask", "what, time, y, ydot, x, v, chamber, trial", "", terms, asked, how="compiled"),
+        function("observed", "time, x, v, chamber, trial", moving, seen),
         function("first_chamber", "trial", released, gauge, "return pressure", at_release=True),
         f"\n@inlined\ndef has_chamber():\n    return {has_chamber}\n",
     ]
     for hook in ("row_delay", "averaged_over"):
         summed = "total = 0.0", calls(hook, "total +="), "return total"
         functions.append(function(hook, "trial", released, *summed, at_release=True))
-    slack = """from vinetrack.dynamics.equations import _never_slack as slack_fraction
-from vinetrack.dynamics.equations import _no_slack_phase as follow_slack
-from vinetrack.dynamics.equations import _not_slack_at_rest as slack_at_rest"""
-    if tail_free:
-        slack = "from vinetrack.dynamics.integrator import follow_slack, slack_at_rest, slack_fraction"
-        resting = f"if resting:\n        {calls('rest_force', 'tip +=', 8) or 'pass'}"
-        tension = "return tip / rig.travel_ratio, chamber_rate"
-        functions += [
-            function("tip_tension", "time, x, v, chamber, resting, trial", moving, terms, resting, chamber, tension),
-            function("free_fall", "time, y, ydot, x, v, chamber, trial", "", terms, "return tail / mass"),
-        ]
     loaded = "\n".join(loads.values())
     return f"""\"""Machine-made: a sum of effects, for the integrator of vinetrack.dynamics.\"""
 
@@ -157,10 +158,10 @@ import sys
 
 from numba import njit
 
-from vinetrack.dynamics.equations import angle_passed, inlined, trace_at
+from vinetrack.dynamics.equations import FREE_FALL, REST_ACCELERATION, REST_TENSION, SEEN, TENSION
+from vinetrack.dynamics.equations import angle_passed, compiled, inlined, trace_at
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.effects import State, TrialInputs
-{slack}
 
 {loaded}
 {"".join(functions)}
@@ -191,11 +192,11 @@ _LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash
 
 
 @lru_cache(maxsize=64)
-def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
+def kernel(effects: tuple[Effect, ...]) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`."""
     import numba
 
-    source = sum_source(effects, tail_free)
+    source = sum_source(effects)
     integrator = (Path(__file__).with_name(name) for name in ("equations.py", "integrator.py"))
     parts = [source, *(file.read_text(encoding="utf-8") for file in integrator)]
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], units)]
@@ -281,8 +282,7 @@ def lay_out(
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
-    tail_free = bool(inputs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
-    if host is None and not tail_free:
+    if host is None:
         host = shared_host(model.effects)
     if host is not None and host.names != model.names:
         resting = np.array([name not in model for name in host.names])
@@ -308,7 +308,7 @@ def lay_out(
         breakpoints=breakpoints,
         stops=stops,
     )
-    return Batch(kernel(model.effects, tail_free).integrate_many, stamps, arrays)
+    return Batch(kernel(model.effects).integrate_many, stamps, arrays)
 
 
 def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
