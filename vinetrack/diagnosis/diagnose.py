@@ -23,8 +23,8 @@ from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_rat
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.replicates import (
-    correct_dropped_frames,
     dropped_frames_in,
+    lost_frames,
     odd_trials,
     with_lost_frames,
     with_odd_trials,
@@ -50,6 +50,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
+from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.tracks.position_noise import rejected_points_note
 
 if TYPE_CHECKING:
@@ -92,7 +93,9 @@ def diagnose(
         model = model or base_model()
         effects = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
-        pairs, dropped = correct_dropped_frames(pairs)
+        if settings is None:  # the tracks of an experiment were corrected as they were read
+            pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
+        dropped = lost_frames((trial.name, track) for trial, track in pairs)
         outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
         fit = fitted if fitted is not None and not dropped else initial_fit(model, pairs, effects, profile=False)

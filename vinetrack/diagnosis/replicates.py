@@ -34,7 +34,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
+from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
 from vinetrack.inference.solving import as_recorded
@@ -170,18 +170,9 @@ def _overruled(result: Diagnosis, words: str, **first: Any) -> Diagnosis:
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
 
 
-def lost_frames(pairs: Iterable[tuple[str, Track]]) -> dict[str, bool]:
+def lost_frames(tracks: Iterable[tuple[str, Track]]) -> dict[str, bool]:
     """Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain."""
-    return {name: frames_surely_missing(track) for name, track in pairs if with_flag(track.flag, "retimed").any()}
-
-
-def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], dict[str, bool]]:
-    """Correct the times of tracks with dropped and repeated frames. Returns pairs, `lost_frames`."""
-    corrected = [
-        (trial, correct_frames(track) if trial.video is None and not with_flag(track.flag, "retimed").any() else track)
-        for trial, track in pairs
-    ]
-    return corrected, lost_frames((trial.name, track) for trial, track in corrected)
+    return {name: frames_surely_missing(track) for name, track in tracks if with_flag(track.flag, "retimed").any()}
 
 
 def dropped_frames_in(fit: Fit) -> dict[str, bool]:
