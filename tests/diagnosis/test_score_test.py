@@ -71,6 +71,15 @@ def test_candidates_are_false_alarms_as_seldom_as_they_say(seed, trials, scatter
     assert sum(each.largest_excess(asked[0].family) > 0 for each in asked) <= most
 
 
+def test_a_size_at_its_bound_takes_nothing_from_an_effect():
+    """Drag is 0 in these tracks, where a fit with it is a fit without it."""
+    pairs, candidate = vt.tracks_from_frame(vt.example_tracks()), catalogue()["leak"]
+    fits = [vt.fit(model, pairs, profile=False) for model in (vt.base_model(), vt.base_model() + "air_drag")]
+    assert [number.bound for number in fits[1].numbers if number.key == "air_drag.C_D"] == [0]
+    without, at_bound = (misfit_tests.misfit_tests(fit, [candidate], FIRST).scores for fit in fits)
+    np.testing.assert_allclose(at_bound.plain_sigma, without.plain_sigma, rtol=3e-3)
+
+
 @pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
 def test_probes_of_nothing_find_structure_as_often_as_they_say(trials, probes, scatter):
     draw = np.random.default_rng(20604)
