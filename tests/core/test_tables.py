@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from vinetrack.core import tables
-from vinetrack.core.problems import ExperimentError
-from vinetrack.core.tables import TableError, parse_number, parse_table, parse_yaml, result_file, safe_join, with_value
+from vinetrack.core.problems import ExperimentError, InputError
+from vinetrack.core.tables import parse_number, parse_table, parse_yaml, result_file, safe_join, with_value
 from vinetrack.experiment.folder import save_model
 
 PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
@@ -63,13 +63,13 @@ def test_cells_and_lines_stay_where_they_are(tmp_path):
     ids=["binary", "empty", "blank", "commas", "named twice", "quote not closed"],
 )
 def test_what_is_no_table_is_refused(tmp_path, data):
-    with pytest.raises(TableError):
+    with pytest.raises(InputError):
         table_of(tmp_path, data)
 
 
 def test_a_recording_named_as_a_table_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "MAX_TABLE_BYTES", 10)
-    with pytest.raises(TableError):
+    with pytest.raises(InputError):
         table_of(tmp_path, PLAIN.encode())
 
 
@@ -81,15 +81,15 @@ def test_numbers_and_what_is_none():
     texts = ("0", "-1.5", "+2", ".5", "5.", "1e3", "2,5E-1", " 7 ")
     assert [parse_number(text) for text in texts] == [0.0, -1.5, 2.0, 0.5, 5.0, 1000.0, 0.25, 7.0]
     for text in NO_NUMBERS:
-        with pytest.raises(TableError):
+        with pytest.raises(InputError):
             parse_number(text)
 
 
 def test_thousands_and_decimals_are_not_guessed():
     """1,069 fps read as 1.069 would be wrong by a factor of a thousand, in silence."""
-    with pytest.raises(TableError, match=r"write 1\.0690 or 1069"):
+    with pytest.raises(InputError, match=r"write 1\.0690 or 1069"):
         parse_number("1,069")
-    with pytest.raises(TableError, match=r"write 1\.0690 or 1069"):
+    with pytest.raises(InputError, match=r"write 1\.0690 or 1069"):
         parse_number("1.069", decimal=",")
     assert parse_number("1,069", decimal=",") == parse_number("1.069") == 1.069
     assert parse_number("0,069") == 0.069
@@ -97,7 +97,7 @@ def test_thousands_and_decimals_are_not_guessed():
     table = parse_table("a;b;c\n0,5;0.5;1,069\n")
     assert table.decimal == ""
     assert table.numbers("a") == table.numbers("b") == [0.5]
-    with pytest.raises(TableError):
+    with pytest.raises(InputError):
         table.numbers("c")
 
 
@@ -119,10 +119,10 @@ NO_NAMES = ("", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n")
 
 def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused():
     for relative in (*OUTSIDE, "a\x00b", "a\nb", "a\u2028b"):
-        with pytest.raises(TableError):
+        with pytest.raises(InputError):
             safe_join(Path("exp"), relative)
     for name in NO_NAMES:
-        with pytest.raises(TableError):
+        with pytest.raises(InputError):
             result_file(Path("results/x/tracks"), name, ".csv")
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hand_sheet import GOOD, HEADER, TRACK, one, two_vines, write
 
-from vinetrack.core.problems import ExperimentError
+from vinetrack.core.problems import ExperimentError, InputError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
 from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment import folder
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.sheet import planned_sheet, planned_trial
-from vinetrack.tracks.importers import TrackError, load_track, read_track
+from vinetrack.tracks.importers import load_track, read_track
 
 
 def corrected(folder: Path, text: str) -> Path:
@@ -111,7 +111,7 @@ def test_frames_and_axis_of_one_trial_alone(tmp_path):
 @pytest.mark.real
 def test_either_of_two_point_masses_of_a_real_project(real):
     path = real / "falling_cups" / "cups.trk"
-    with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
+    with pytest.raises(InputError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
         read_track(path, point_mass="cup")
     third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
     # The heavier stack falls further over the same frames.

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from nptdms import ChannelObject, TdmsWriter
 
+from vinetrack.core.problems import InputError
 from vinetrack.core.records import Trial, plain_track, with_flag
 from vinetrack.tracks import importers
-from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track
+from vinetrack.tracks.importers import read_pressure_trace, read_track
 
 TIMES = np.arange(8) / 100
 POSITIONS = 0.5 * 9.81 * TIMES**2
@@ -68,7 +69,7 @@ NO_TRACKS = [
 
 @pytest.mark.parametrize("text", NO_TRACKS)
 def test_an_invalid_track_is_refused(tmp_path, text):
-    with pytest.raises(TrackError):
+    with pytest.raises(InputError):
         read_track(write(tmp_path, text))
 
 
@@ -165,7 +166,7 @@ NO_PROJECTS = [
 
 @pytest.mark.parametrize("text", NO_PROJECTS)
 def test_projects_that_cannot_be_used(tmp_path, text):
-    with pytest.raises(TrackError):
+    with pytest.raises(InputError):
         read_track(write(tmp_path, text, "tip.trk"))
 
 
@@ -178,7 +179,7 @@ def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_anoth
     )
     short = importers.attach_pressure(track, np.array([0.0, 2.0]), np.array([2e4, 1e4]))
     np.testing.assert_allclose(short.pressure_Pa, [2e4, 1.5e4, 1e4, 1e4, 1e4])
-    with pytest.raises(TrackError):
+    with pytest.raises(InputError):
         importers.attach_pressure(track, np.array([100.0, 200.0]), np.array([2e4, 1e4]))
 
 
@@ -330,7 +331,7 @@ NO_TRACES = {
 
 @pytest.mark.parametrize("made", NO_TRACES.values(), ids=NO_TRACES)
 def test_unsupported_content_is_refused(tmp_path, made):
-    with pytest.raises(TrackError):
+    with pytest.raises(InputError):
         read_tdms(tmp_path, made)
 
 
@@ -338,6 +339,6 @@ def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path):
     for place in range(len(BOTH_CHANNELS)):
         damaged = bytearray(BOTH_CHANNELS)
         damaged[place] ^= 0x5A
-        with contextlib.suppress(TrackError):
+        with contextlib.suppress(InputError):
             time_s, pressure_Pa = read_tdms(tmp_path, bytes(damaged))
             assert time_s.shape == pressure_Pa.shape

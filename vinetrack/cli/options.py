@@ -23,10 +23,10 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.core.problems import ExperimentError, UserError, format_problems
+from vinetrack.core.problems import ExperimentError, InputError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
 from vinetrack.core.terminal import print_line
-from vinetrack.experiment.schema import COLUMNS, CellError, Column, option
+from vinetrack.experiment.schema import COLUMNS, Column, option
 
 # ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
@@ -210,7 +210,7 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
     if kind == "column" and given is not None:
         try:
             return COLUMNS[line["field"]].read(given)
-        except CellError as error:
+        except InputError as error:
             raise _refused(line, f"{given!r} {error.message}: {error.allowed or error.remedy}") from None
     if kind in ("list", "object") and given is not None:
         try:

@@ -67,8 +67,10 @@ class UserError(Exception):
     """An error that the user can correct, printed as its message; any other exception is a fault of the program."""
 
 
-class InputError(UserError):
-    """An input that cannot be used: what is wrong (`message`, `code`), the remedy, and what is allowed."""
+class InputError(UserError, ValueError):
+    """A file or a value that cannot be used: what is wrong (`message`, `code`), the remedy, and what is allowed. In a
+    settings model pydantic reports it as an error of its key.
+    """
 
     def __init__(self, message: str, remedy: str = "", allowed: str = "", code: str = "") -> None:
         super().__init__(f"{message}: {remedy}" if remedy else message)

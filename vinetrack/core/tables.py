@@ -126,10 +126,6 @@ _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.AS
 _AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # Such as 1,069 or 1.069
 
 
-class TableError(InputError):
-    """A file that cannot be read as a table, or a cell that is not a number: one sentence with a remedy."""
-
-
 @dataclass(frozen=True)
 class Table:
     """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank or if the line is
@@ -160,9 +156,9 @@ class Table:
             if cell or not blank_is_nan:
                 try:
                     values[i] = parse_number(cell, self.decimal)
-                except TableError as error:
+                except InputError as error:
                     message = f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error.message}"
-                    raise TableError(message, error.remedy) from None
+                    raise InputError(message, error.remedy) from None
         return values
 
 
@@ -170,40 +166,47 @@ def parse_number(text: str, decimal: str = ".") -> float:
     """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else."""
     text = text.strip()
     if text == "":
-        raise TableError("is blank", "write a number", code="blank")
+        raise InputError("is blank", "write a number", code="blank")
     if not _NUMBER.fullmatch(text):
-        raise TableError("is not a number", "write digits only, without unit or separators", code="not_a_number")
+        raise InputError("is not a number", "write digits only, without unit or separators", code="not_a_number")
     if _AMBIGUOUS_NUMBER.fullmatch(text) and ("," if "," in text else ".") != decimal:
         remedy = f"write {text.replace(',', '.')}0 or {re.sub('[.,]', '', text)}, whichever is meant"
-        raise TableError("may be thousands or decimals", remedy, code="ambiguous_number")
+        raise InputError("may be thousands or decimals", remedy, code="ambiguous_number")
     value = float(text.replace(",", "."))
     if not math.isfinite(value):
-        raise TableError("is too large a number", code="above_bounds")
+        raise InputError("is too large a number", code="above_bounds")
     return value
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file that is no recording."""
+    try:
+        is_small = file_size(path) <= MAX_TABLE_BYTES
+        data = path.read_bytes() if is_small else b""
+    except FileNotFoundError:
+        raise InputError(*missing_file_message(path)) from None
+    except (OSError, ValueError) as error:
+        raise InputError("cannot be read", getattr(error, "strerror", None) or "it cannot be opened") from None
+    if not is_small:
+        raise InputError("is too large to be a table", "is it a recording?")
+    return data
 
 
 def read_text(path: Path) -> str:
     r"""Read a text file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
-    try:
-        if file_size(path) > MAX_TABLE_BYTES:
-            raise TableError("is too large to be a table", "is it a recording?")
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise TableError(*missing_file_message(path)) from None
-    except (OSError, ValueError) as error:
-        raise TableError("cannot be read", getattr(error, "strerror", None) or "it cannot be opened") from None
+    data = read_bytes(path)
     if data.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
         encodings = ["utf-32"]
     elif data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encodings = ["utf-16"]
     elif b"\x00" in data:
-        raise TableError("is not text", "save the table as CSV (comma or semicolon separated)")
+        raise InputError("is not text", "save the table as CSV (comma or semicolon separated)")
     else:
         encodings = ["utf-8-sig", "cp1252"]
     for encoding in encodings:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
-    raise TableError("is not readable as text", "save it as CSV in UTF-8")
+    raise InputError("is not readable as text", "save it as CSV in UTF-8")
 
 
 def read_table(path: Path) -> Table:
@@ -222,11 +225,11 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         delimiter = max("\t;,", key=header.count) if re.search("[\t;,]", header) else ","
     records = [(line, cells) for line, cells in _records("\n".join(lines), delimiter) if any(cells)]
     if not records:
-        raise TableError("is empty", "its first line must name the columns")
+        raise InputError("is empty", "its first line must name the columns")
     (_, columns), *body = records
     named, width = tuple(filter(None, columns)), len(columns)
     if repeated := sorted({column for column in named if named.count(column) > 1}):
-        raise TableError(f"names the column {repeated[0]!r} twice", "keep one of them")
+        raise InputError(f"names the column {repeated[0]!r} twice", "keep one of them")
     pairs = [list(zip_longest(columns, cells[:width], fillvalue="")) for _, cells in body]
     return Table(
         columns=named,
@@ -251,9 +254,9 @@ def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
             break
         except csv.Error as error:
             if "end of data" in str(error):
-                raise TableError("has a quotation mark that is never closed", "remove it") from None
+                raise InputError("has a quotation mark that is never closed", "remove it") from None
             if not strict:
-                raise TableError(f"is not a table ({error})", "save it as CSV") from None
+                raise InputError(f"is not a table ({error})", "save it as CSV") from None
     return records
 
 
@@ -273,21 +276,21 @@ def safe_join(folder: Path, relative: str) -> Path:
     text = relative.strip().replace("\\", "/")
     # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
-        raise TableError("contains characters that no path should have", "type it again")
+        raise InputError("contains characters that no path should have", "type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
-        raise TableError("is an absolute path", "write it relative to the experiment folder")
+        raise InputError("is an absolute path", "write it relative to the experiment folder")
     inside = posixpath.normpath(text)
     if inside.split("/")[0] == "..":
-        raise TableError("leads out of the experiment folder", "move the file into it, or put a link there")
+        raise InputError("leads out of the experiment folder", "move the file into it, or put a link there")
     if inside == ".":
-        raise TableError("names no file", "write a path relative to the experiment folder")
+        raise InputError("names no file", "write a path relative to the experiment folder")
     return folder / inside
 
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
     """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):
-        raise TableError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
+        raise InputError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
     return folder / f"{name}{suffix}"
 
 
@@ -367,7 +370,7 @@ def read_yaml(path: Path) -> YamlDocument:
     """Read a YAML file that holds one mapping; an empty file is an empty mapping."""
     try:
         return parse_yaml(read_text(path), path.name)
-    except TableError as error:
+    except InputError as error:
         raise ExperimentError([Problem.from_error(error, path.name)]) from None
 
 

@@ -20,12 +20,12 @@ import numpy as np
 
 import vinetrack
 from vinetrack.core import tables
-from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
-from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
+from vinetrack.tracks.importers import load_track, read_pressure_trace, read_track
 
 SETTINGS = "experiment.yaml"
 
@@ -144,7 +144,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     for key, relative in settings.paths:
         try:
             tables.safe_join(folder, relative)
-        except tables.TableError as error:
+        except InputError as error:
             problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
@@ -209,7 +209,7 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     path = tables.safe_join(folder, row.values[column])
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
-    except TrackError as error:
+    except InputError as error:
         return row.add_error(error, column, row.values[column])
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
@@ -238,7 +238,7 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         return {}, []
     try:
         table = tables.read_table(folder / CORRECTIONS_FILE)
-    except tables.TableError as error:
+    except InputError as error:
         return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
     if missing := [name for name in CORRECTION_COLUMNS if name not in table.columns]:
         remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
@@ -250,17 +250,17 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         column = "action"
         try:
             if row["action"] not in ("move", "drop", "confirm"):
-                raise tables.TableError("is not an action", "write move, drop or confirm", code="not_a_choice")
+                raise InputError("is not an action", "write move, drop or confirm", code="not_a_choice")
             column = "edge_px"
             edge_px = tables.parse_number(row["edge_px"], table.decimal) if row["action"] == "move" else math.nan
             column = "frame"
             frame = tables.parse_number(row["frame"], table.decimal)
             if frame < 0 or frame != int(frame):
-                raise tables.TableError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
+                raise InputError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
             if frame in by_frame:
-                raise tables.TableError("is corrected twice", "keep one of the lines", code="twice")
+                raise InputError("is corrected twice", "keep one of the lines", code="twice")
             by_frame[int(frame)] = Correction(int(frame), row["action"], edge_px)
-        except tables.TableError as error:
+        except InputError as error:
             place: dict[str, Any] = {"line": line, "trial": row["trial"], "column": column, "value": row[column]}
             problems.append(Problem.from_error(error, CORRECTIONS_FILE, **place))
     return {name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()}, problems
@@ -400,7 +400,7 @@ def _check_track(trial: Trial) -> list[Problem]:
     place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
     try:
         track = load_track(trial)
-    except TrackError as error:
+    except InputError as error:
         return [Problem.from_error(error, SHEET, **place)]
     remarks = {}
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps

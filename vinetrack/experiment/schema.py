@@ -27,10 +27,6 @@ from vinetrack.core.units import NO_UNIT, UNITS, Unit, convert, split_unit
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
 
-class CellError(InputError, ValueError):
-    """A value that its column does not allow; pydantic reports it as an error of its key."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Column:
     """A column of the trial sheet. `field` is the field of `Trial` that holds the value, in SI where it is a number;
@@ -99,7 +95,7 @@ class Column:
                     return text
                 case "yes_no":
                     if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):
-                        raise CellError("is neither yes nor no", code="not_yes_or_no")
+                        raise InputError("is neither yes nor no", code="not_yes_or_no")
                     return text.lower() in ("yes", "y", "true", "1")
                 case "window" | "frames":
                     return _read_span(text, decimal, of_frames=self.kind == "frames")
@@ -109,24 +105,25 @@ class Column:
                     return _read_axis(text)
             return self._checked(parse_number(text, decimal))
         except InputError as error:
-            raise CellError(error.message, error.remedy, self.allowed, error.code) from None
+            error.allowed = self.allowed
+            raise
 
     def read_limit(self, value: Any) -> float:
         """Read one number of `limits`, checked like a cell of the column."""
         if isinstance(value, bool | list | tuple | dict):
-            raise CellError("holds something that is not a number", "write numbers only", code="not_a_number")
+            raise InputError("holds something that is not a number", "write numbers only", code="not_a_number")
         return float(str(self.read(str(value).strip())))
 
     def _checked(self, value: float) -> float:
         """Return the value unchanged if its column allows it."""
         if self.kind == "choice" and value not in (1, 2):
-            raise CellError("is not a travel ratio", code="not_a_choice")
+            raise InputError("is not a travel ratio", code="not_a_choice")
         if value > self.high:
             message = f"is above {self.high:g} {self.unit}"
-            raise CellError(message, self._likely_unit(value), code="above_bounds")
+            raise InputError(message, self._likely_unit(value), code="above_bounds")
         if value < self.low or (self.above_low and value == self.low):
             message = f"{'is not above' if self.above_low else 'is below'} {self.low:g} {self.unit}".strip()
-            raise CellError(message, self._likely_unit(value), code="below_bounds")
+            raise InputError(message, self._likely_unit(value), code="below_bounds")
         return value
 
     def unusual(self, value: Any) -> str:
@@ -188,10 +185,10 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     """Read `low:high` or two numbers, each checked like a cell of the column and in its unit."""
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
-        raise CellError("is not a range", "write low:high, such as 7:40", code="not_a_range")
+        raise InputError("is not a range", "write low:high, such as 7:40", code="not_a_range")
     low, high = (column.read_limit(part) for part in parts)
     if low > high:
-        raise CellError("ends below its start", "write the lower value first", code="reversed")
+        raise InputError("ends below its start", "write the lower value first", code="reversed")
     return low, high
 
 
@@ -200,10 +197,10 @@ def _read_span(text: str, decimal: str, of_frames: bool) -> tuple[float, float]:
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 2 or (of_frames and not all(part.isascii() and part.isdigit() for part in parts)):
         kind, code = ("range of frames", "not_a_range") if of_frames else ("window", "not_a_window")
-        raise CellError(f"is not a {kind}", code=code)
+        raise InputError(f"is not a {kind}", code=code)
     first, last = (int(part) if of_frames else parse_number(part, decimal) for part in parts)
     if first >= last:
-        raise CellError("ends before it starts", code="reversed")
+        raise InputError("ends before it starts", code="reversed")
     return first, last
 
 
@@ -212,19 +209,19 @@ def _read_axis(text: str) -> PictureAxis:
     parts, width = text.split(":"), math.nan
     written = parts if "," in parts[-1] else parts[:-1]
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
-        raise CellError("is not an axis", code="not_an_axis")
+        raise InputError("is not an axis", code="not_an_axis")
     points = [(parse_number(x), parse_number(y)) for x, y in (point.split(",") for point in written)]
     spacings = [math.dist(*pair) for pair in pairwise(points)]
     if sum(spacings) < SHORTEST_AXIS_PX:
         message = f"is shorter than {SHORTEST_AXIS_PX} pixels"
-        raise CellError(message, "give two points far apart", code="too_short")
+        raise InputError(message, "give two points far apart", code="too_short")
     if len(points) > 2 and min(spacings) < SMALLEST_POINT_SPACING_PX:
         message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-        raise CellError(message, "leave out the second of the two", code="too_close")
+        raise InputError(message, "leave out the second of the two", code="too_close")
     if len(parts) > len(written):
         width = parse_number(parts[-1]) / 1000
         if width <= 0:
-            raise CellError("has a width that is not positive", code="not_positive")
+            raise InputError("has a width that is not positive", code="not_positive")
     return PictureAxis(points[0], points[-1], width, tuple(points[1:-1]))
 
 
@@ -234,10 +231,10 @@ def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
     for piece in filter(None, (piece.strip() for piece in text.split(";"))):
         parts = piece.split(":")
         if len(parts) != 3:
-            raise CellError(f"has a bend {piece!r} that is not three numbers", code="not_bends")
+            raise InputError(f"has a bend {piece!r} that is not three numbers", code="not_bends")
         start, arc, radius = (parse_number(part, decimal) / 1000 for part in parts)
         if start < 0 or arc <= 0 or radius <= 0:
-            raise CellError(f"has a bend {piece!r} with a length that is not positive", code="not_positive")
+            raise InputError(f"has a bend {piece!r} with a length that is not positive", code="not_positive")
         bends.append(Bend(start, arc, radius))
     return tuple(bends)
 

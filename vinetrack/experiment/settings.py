@@ -22,16 +22,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
 from pydantic.functional_validators import BeforeValidator, field_validator, model_validator
 
-from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
-from vinetrack.core.tables import Table, TableError, YamlDocument, parse_number, read_yaml
+from vinetrack.core.problems import ExperimentError, InputError, Problem, did_you_mean
+from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
-from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, CellError, read_range
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, read_range
 
 
 def _no_yes_or_no(value: Any) -> Any:
     """Refuse yes and no, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
-        raise CellError("is yes or no where a number belongs", "write the number", code="not_a_number")
+        raise InputError("is yes or no where a number belongs", "write the number", code="not_a_number")
     return value
 
 
@@ -69,7 +69,7 @@ class _TwoEnds(_Strict):
         through = (self.from_px, *(getattr(self, "via_px", None) or ()), self.to_px)
         if any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
             message = f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-            raise CellError(message, "name points farther apart", code="too_close")
+            raise InputError(message, "name points farther apart", code="too_close")
         return self
 
 
@@ -130,7 +130,7 @@ class Charuco(Board):
     def _markers_fit(self) -> Charuco:
         if self.marker_mm >= self.square_mm:
             message, remedy = "marker_mm is not smaller than square_mm", "markers lie inside their squares"
-            raise CellError(message, remedy, code="markers")
+            raise InputError(message, remedy, code="markers")
         return self
 
 
@@ -174,7 +174,7 @@ class Limits(_columns(chain(*LIMITED.values()))):  # type: ignore[misc]
             return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps[1:-1]), high}))
         limits = value if isinstance(value, list | tuple) else [value]
         if not limits:
-            raise CellError("is empty", "name at least one value, or remove the key", code="empty")
+            raise InputError("is empty", "name at least one value, or remove the key", code="empty")
         return tuple(sorted({column.read_limit(limit) for limit in limits}))
 
 
@@ -229,14 +229,14 @@ class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
         if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
             return value
         if isinstance(value, bool | list | dict):
-            raise CellError("is not a single value", "write one, as in the sheet", code="not_a_value")
+            raise InputError("is not a single value", "write one, as in the sheet", code="not_a_value")
         return column.read(str(value).strip())
 
     @field_validator("model", "candidates", "effects")
     @classmethod
     def _named_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if names and (twice := sorted({name for name in names if names.count(name) > 1})):
-            raise CellError(f"names {twice[0]!r} twice", "keep one", code="twice")
+            raise InputError(f"names {twice[0]!r} twice", "keep one", code="twice")
         return names
 
 
@@ -285,7 +285,7 @@ class FigureSettings(_Strict):
     @classmethod
     def _some(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
-            raise CellError("is empty", "name at least one of png, svg, pdf", code="empty")
+            raise InputError("is empty", "name at least one of png, svg, pdf", code="empty")
         return tuple(dict.fromkeys(formats))
 
 
@@ -364,7 +364,7 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
         return Problem("missing", "is missing", remedy="add it", **place)
     place["value"] = str(detail["input"]) if isinstance(detail["input"], str | int | float | bool) else None
     error = detail.get("ctx", {}).get("error")
-    if isinstance(error, CellError):
+    if isinstance(error, InputError):
         return Problem.from_error(error, **place)
     words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
     words = re.sub(r"a valid dictionary.*", "a group of keys", words)
@@ -425,7 +425,7 @@ def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
         return ":".join(_converted(part, unit, name, decimal) for part in value.split(":"))
     try:
         number = convert(parse_number(str(value), decimal), unit, split_unit(name)[1])
-    except TableError:
+    except InputError:
         return value
     return f"{number:.15g}".replace(".", decimal or ".") if isinstance(value, str) else float(f"{number:.15g}")
 

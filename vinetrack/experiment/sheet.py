@@ -16,8 +16,8 @@ from typing import Any
 
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
-from vinetrack.core.tables import Table, TableError, read_table, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, with_names
+from vinetrack.core.tables import Table, read_table, safe_join
+from vinetrack.experiment.schema import COLUMNS, SHARED, option, with_names
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units, read_experiment_settings
 
 SHEET = "trials.csv"
@@ -79,7 +79,7 @@ class Row:
             if name in self.values:
                 try:
                     safe_join(folder, self.values[name])
-                except TableError as error:
+                except InputError as error:
                     self.add_error(error, name, self.values[name])
         if "video" in self.values and "track" in self.values:
             message, remedy = "has both a video and a track", "keep one of the two"
@@ -157,7 +157,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
                     row.add("unusual", said, name, "warning", value=text)
             elif name in SHARED and (shared := getattr(settings, name)) is not None:
                 row.values[name] = shared
-        except CellError as error:
+        except InputError as error:
             row.add_error(error, name, text)
     if table.extra[index]:
         message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
@@ -171,7 +171,7 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
     """Read a sheet in the units of its columns, and what is wrong with its columns; unknown ones are ignored."""
     try:
         table, problems = in_sheet_units(read_table(path), path.name)
-    except TableError as error:
+    except InputError as error:
         raise ExperimentError([Problem.from_error(error, path.name)]) from None
     warning = partial(Problem, file=path.name, severity="warning")
     message = "is not a column of the trial sheet and is ignored"
@@ -201,7 +201,7 @@ def _may_state_rate(folder: Path, video: str) -> bool:
         path = safe_join(folder, video)
         files = path.iterdir() if path.is_dir() else [path, *map(path.with_suffix, SIDE_FILES)]
         return any(file.suffix.lower() in {".dng", *CAMERA_FILES} and file.exists() for file in files)
-    except (TableError, OSError, ValueError):
+    except (OSError, ValueError):
         return False
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.problems import InputError, UserError
 from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
@@ -328,7 +328,7 @@ def pairs_of(
     """
     from vinetrack.experiment.folder import Experiment, read_experiment
     from vinetrack.tracks.frame_timing import correct_frames
-    from vinetrack.tracks.importers import TrackError, load_track
+    from vinetrack.tracks.importers import load_track
 
     if isinstance(experiment, (str, Path)):
         experiment = read_experiment(experiment)
@@ -344,7 +344,7 @@ def pairs_of(
             continue
         try:
             pairs.append((trial, correct_frames(load_track(trial))))
-        except TrackError as error:
+        except InputError as error:
             left_out[trial.name] = str(error)
     return pairs, left_out
 

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CONTAINERS, IMAGES, Correction
 from vinetrack.core.tables import (
     MIN_PICTURES,
     PROVENANCE,
     Table,
-    TableError,
     entries,
     is_calibration,
     list_recordings,
@@ -77,7 +76,7 @@ def read_sheet(folder: Path) -> Table:
         return Table(columns, (), (), (), ",", ".")
     try:
         table = read_table(path)
-    except TableError as error:
+    except InputError as error:
         raise ExperimentError([Problem.from_error(error, SHEET)]) from None
     loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
     if loose or table.nameless:

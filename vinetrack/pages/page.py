@@ -17,8 +17,7 @@ from bokeh.server.tornado import BokehTornado
 from markupsafe import Markup
 from tornado.ioloop import IOLoop
 
-from vinetrack.core.problems import ExperimentError, format_problems
-from vinetrack.core.tables import TableError
+from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
@@ -403,7 +402,7 @@ class Page:
         folder, effects = self.campaign.experiment.folder, self.choice.effects
         try:
             path = save_model(folder, effects)
-        except (ExperimentError, TableError, OSError) as error:
+        except (ExperimentError, InputError, OSError) as error:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
-from vinetrack.core.problems import ExperimentError, Problem, UserError
+from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError
 from vinetrack.core.records import Correction
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join, with_value
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
@@ -50,7 +50,7 @@ from vinetrack.pages.draft_files import (
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, PageServer, jpeg
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
-from vinetrack.tracks.importers import TrackError, attach_pressure, read_pressure_trace
+from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.curved_axis import axis_entry, axis_through
@@ -138,7 +138,7 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
     if timed and trial.pressure_trace is not None:
         try:
             track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
-        except (TrackError, OSError) as error:
+        except (InputError, OSError) as error:
             notes.append(f"pressure_trace {error}")
     # Without a rate the figure counts frames.
     drawn = track if timed else replace(track, time_s=np.full_like(track.time_s, np.nan))

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.tables import TableError, safe_join, write_text
+from vinetrack.core.problems import ExperimentError, InputError, Problem
+from vinetrack.core.tables import safe_join, write_text
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import check_needs, make_model
 from vinetrack.effects import Effect, EffectError, catalogue, explanation, find_effect, listing, own_effects, remember
@@ -43,7 +43,7 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
     settings = read_experiment_settings(experiment / "experiment.yaml")
     try:
         return own_effects([safe_join(experiment, path) for path in settings.effects])
-    except TableError as error:
+    except InputError as error:
         raise ExperimentError([Problem(message=str(error), file="experiment.yaml", column="effects")]) from None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError, Problem, format_problems, remark
+from vinetrack.core.problems import ExperimentError, InputError, Problem, format_problems, remark
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import write_csv
 from vinetrack.core.terminal import progress, table, waiting
@@ -20,7 +20,7 @@ from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.experiment.schema import COLUMNS, CellError, option, read_range
+from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
@@ -297,7 +297,7 @@ def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]
     """Read `low:high` or one number, each checked like a cell of the column; return both in SI."""
     try:
         low, high = read_range(COLUMNS[column], text if ":" in text else (text, text))
-    except CellError as error:
+    except InputError as error:
         raise refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
     return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import INTERNAL_ERROR
+from vinetrack.core.problems import INTERNAL_ERROR, InputError
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_csv, write_json
 from vinetrack.dynamics.model import Model, make_model
@@ -45,7 +45,7 @@ from vinetrack.results.folder_layout import (
     read_json,
     read_result,
 )
-from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
+from vinetrack.tracks.importers import load_track, with_pressure_trace
 from vinetrack.video.axis import askew_trials, slope_deg
 from vinetrack.video.curved_axis import axis_entry
 from vinetrack.video.frames import RecordingError
@@ -94,8 +94,8 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             track, columns, view = _of_recording(trial, measurement, experiment)
             summary = summarise_trial(trial, track, settings, model_of(experiment))
-    except (RecordingError, TrackError, TrialError) as error:
-        from_file = trial.track if trial is not None and trial.video is None and isinstance(error, TrackError) else None
+    except (RecordingError, InputError, TrialError) as error:
+        from_file = trial.track if trial is not None and trial.video is None and isinstance(error, InputError) else None
         reason = f"{from_file.name} {error}" if from_file else str(error)
     except Exception as error:
         if is_disk_full(error):

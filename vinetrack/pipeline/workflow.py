@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
+from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.core.units import number
@@ -325,7 +325,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
-    from vinetrack.tracks.importers import TrackError, load_track
+    from vinetrack.tracks.importers import load_track
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
     from vinetrack.video.survey import Surveyor, axis_notes, direction_notes, facts_entry, facts_rows
 
@@ -341,7 +341,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     entries, tracks = [facts[trial.name] for trial in trials], []
     for trial in experiment.trials:
         if trial.track is not None:
-            with contextlib.suppress(TrackError):
+            with contextlib.suppress(InputError):
                 tracks.append((trial, load_track(trial)))
     speeds = [(trial, entry.mean_speed_m_s) for trial, entry in zip(trials, entries, strict=True)]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.problems import InputError, UserError
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import result_file
 
@@ -229,7 +229,7 @@ def measured_trials(
 
 def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """Make a track of `tracks/<trial>.csv`, with the pressure measured in the user's track or trace."""
-    from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
+    from vinetrack.tracks.importers import load_track, with_pressure_trace
 
     names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px", "lead_position_systematic_m")
     columns: dict[str, Any] = {name: table[name].to_numpy(dtype=float) for name in names}
@@ -240,7 +240,7 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
         if trial.pressure_trace is not None:
             return with_pressure_trace(trial, track)
         source_track = load_track(trial) if trial.track is not None else None
-    except TrackError as error:
+    except InputError as error:
         raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
     if source_track is None or source_track.pressure_Pa is None:
         return track

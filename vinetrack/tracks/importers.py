@@ -19,7 +19,7 @@ import numpy as np
 
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
-from vinetrack.core.tables import MAX_TABLE_BYTES, Table, TableError, file_size, parse_table, read_table, read_text
+from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
 from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
@@ -34,10 +34,6 @@ FEWEST_POINTS = 5  # Fewest points of a track (derived)
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 
-class TrackError(InputError):
-    """A file that cannot be used as a track or a pressure trace."""
-
-
 def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
     """Refuse times that do not increase from row to row. Shapes: time_s (n,)."""
     wrong = np.flatnonzero(np.diff(time_s) <= 0)
@@ -45,7 +41,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
         i = int(wrong[0]) + 1
         place = f"line {lines[i]}, column time_s: " if lines else ""
         message = f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s)"
-        raise TrackError(message, "sort or correct the rows")
+        raise InputError(message, "sort or correct the rows")
 
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
@@ -57,9 +53,9 @@ def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
         value = float(pressure_kPa[wrong[0]])
         where = f"line {lines[wrong[0]]}, column pressure_kPa: {value:g}"
         if value < 0:
-            raise TrackError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
+            raise InputError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
         hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1e6 else ""
-        raise TrackError(f"{where} is above 1000 kPa{hint}")
+        raise InputError(f"{where} is above 1000 kPa{hint}")
 
 
 def new_track(
@@ -76,9 +72,9 @@ def new_track(
     """
     known = np.isfinite(lead_position_m)
     if (count := int(np.sum(known))) < FEWEST_POINTS:
-        raise TrackError(f"has {count} point{'s' * (count != 1)}", f"at least {FEWEST_POINTS} are needed")
+        raise InputError(f"has {count} point{'s' * (count != 1)}", f"at least {FEWEST_POINTS} are needed")
     if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
-        raise TrackError("holds a time or position too large to be one", "correct it")
+        raise InputError("holds a time or position too large to be one", "correct it")
     check_times(time_s)
     first, last = lead_position_m[known][[0, -1]]
     backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
@@ -130,29 +126,24 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
         from nptdms import TdmsFile
     except ModuleNotFoundError:
         remedy = "pip install 'vinetrack[cameras]', or use a CSV"
-        raise TrackError("is a TDMS file, which npTDMS reads", remedy) from None
-    try:
-        if file_size(path) > MAX_TABLE_BYTES:
-            raise TrackError("is too large", "keep only its pressure channels")
-        data = path.read_bytes()
-    except OSError as error:
-        raise TrackError("cannot be read", f"{error.strerror}") from None
+        raise InputError("is a TDMS file, which npTDMS reads", remedy) from None
+    data = read_bytes(path)
     # Of a file that is cut short npTDMS reads the rest: the lengths that its segments state are followed.
     place, damaged = 0, "export it from LabVIEW again, or as CSV"
     while place < len(data):
         length = data[place + 12 : place + 20]
         if data[place : place + 4] != b"TDSm" or len(length) < 8:
-            raise TrackError("is no whole TDMS file", damaged)
+            raise InputError("is no whole TDMS file", damaged)
         place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
     if place > len(data):
-        raise TrackError("is cut short", damaged)
+        raise InputError("is cut short", damaged)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             groups = TdmsFile.read(io.BytesIO(data)).groups()
             found = [(channel.name, channel.properties, channel[:]) for group in groups for channel in group.channels()]
     except Exception as error:  # Damaged files end in errors of many kinds.
-        raise TrackError(f"is no whole TDMS file ({error})", damaged) from None
+        raise InputError(f"is no whole TDMS file ({error})", damaged) from None
     named = {}
     for name, properties, values in found:
         unit = str(properties.get("unit_string", ""))
@@ -161,7 +152,7 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
     pressure = next((name for name in named if name.startswith("pressure")), None)
     if pressure is None:
         there = ", ".join(list(named)[:8]) or "none"
-        raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]})", "name it so in LabVIEW")
+        raise InputError(f"lacks a channel pressure_kPa (found: {there[:120]})", "name it so in LabVIEW")
     properties, samples = named[pressure]
     pressure_kPa: Floats = _in_unit(pressure, samples, "kPa")
     for name, (_, values) in named.items():
@@ -169,7 +160,7 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
             return _in_unit(name, values, "s"), pressure_kPa
     step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
     if not step > 0:
-        raise TrackError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
+        raise InputError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
     return start + step * np.arange(len(samples), dtype=float), pressure_kPa
 
 
@@ -178,11 +169,11 @@ def _in_unit(name: str, values: np.ndarray, wanted: str) -> Floats:
     unit = split_unit(name)[1]
     if not unit or not np.all(np.isfinite(values)):
         fault = "holds a sample that is no number" if unit else "states no unit"
-        raise TrackError(f"channel {name[:40]} {fault}", "correct it in LabVIEW")
+        raise InputError(f"channel {name[:40]} {fault}", "correct it in LabVIEW")
     try:
         return np.asarray(values, dtype=float) * (1.0 if unit == wanted else convert(1.0, unit, wanted))
     except ValueError as error:
-        raise TrackError(f"channel {name}: {error}") from None
+        raise InputError(f"channel {name}: {error}") from None
 
 
 # ------------------------------------------------------------------------------
@@ -202,19 +193,19 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
 
     # Documents that define entities are refused: they can expand without end.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
+        raise InputError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
     try:
         root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
     except (ElementTree.ParseError, ValueError, RecursionError):
-        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
+        raise InputError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
     panel = next((node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")), None)
     if panel is None:
-        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
+        raise InputError("holds no Tracker panel", "save the project as .trk in Tracker")
     name, marks, others = _choose_mass(panel, point_mass)
     first, last = frames_used or (0, max(marks))
     marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
     if not marks:
-        raise TrackError(f"holds no marks of {name!r} in frames {first} to {last}", "widen frames_used")
+        raise InputError(f"holds no marks of {name!r} in frames {first} to {last}", "widen frames_used")
     frames = np.array(sorted(marks))
     pixels = np.array([marks[frame] for frame in sorted(marks)])
     frame_s, start_s, start_frame = _clock(panel)
@@ -249,14 +240,14 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
             masses.append((name.strip()[:40], _frame_values(node, "x", "y")))
     marked = [(name, marks) for name, marks in masses if marks]
     if not marked:
-        raise TrackError("holds no point mass with marks", "mark the leading edge as a point mass in Tracker")
+        raise InputError("holds no point mass with marks", "mark the leading edge as a point mass in Tracker")
     best = max(range(len(marked)), key=lambda i: len(marked[i][1]))
     if wanted:
         named = [i for i, (name, _) in enumerate(marked) if name.casefold() == wanted.strip().casefold()]
         if len(named) != 1:
             names = ", ".join(repr(name) for name, _ in marked)
             many = "several point masses" if named else "no point mass"
-            raise TrackError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
+            raise InputError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
         best = named[0]
     name, marks = marked[best]
     return name, marks, [other for i, (other, _) in enumerate(marked) if i != best]
@@ -281,11 +272,11 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     coords = _object(panel, "coords")
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
     if not values:
-        raise TrackError("holds no coordinate system", "calibrate it in Tracker")
+        raise InputError("holds no coordinate system", "calibrate it in Tracker")
     if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in values.values()):
-        raise TrackError("holds a scale that is not positive", "calibrate it anew in Tracker")
+        raise InputError("holds a scale that is not positive", "calibrate it anew in Tracker")
     if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
-        raise TrackError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
+        raise InputError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
     return values
 
 
@@ -296,7 +287,7 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     spacings = [_number(node, "delta_t") for node in (control, video) if node is not None]
     frame_ms = next((spacing for spacing in spacings if math.isfinite(spacing) and spacing > 0), math.nan)
     if math.isnan(frame_ms):
-        raise TrackError("does not say how long a frame lasts", "set the frame rate in Tracker's clip settings")
+        raise InputError("does not say how long a frame lasts", "set the frame rate in Tracker's clip settings")
     start_ms, start_frame = (
         0.0 if clip is None else float(np.nan_to_num(_number(clip, name))) for name in ("starttime", "startframe")
     )
@@ -342,7 +333,7 @@ def read_export(table: Table) -> Track:
         name, unit = _physics_tracker_column(column)
         columns.setdefault(name, (column, unit))
     if "t" not in columns or not {"x", "y"} & columns.keys():
-        raise TrackError("has no columns t and x or y", "export them from Tracker with one separator throughout")
+        raise InputError("has no columns t and x or y", "export them from Tracker with one separator throughout")
     time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"][1] or "s", "s"))
     check_times(time_s, table.lines)
     places = [columns[name] for name in ("x", "y") if name in columns]
@@ -362,7 +353,7 @@ def _factor(unit: str, si: str) -> float:
     known = UNITS.get(unit.replace("µ", "u"))
     if known is None or known.si != si:
         others = ", ".join(key for key, other in UNITS.items() if other.si == si)
-        raise TrackError(f"has an unknown unit {unit[:20]!r}", f"use one of {others} in Tracker")
+        raise InputError(f"has an unknown unit {unit[:20]!r}", f"use one of {others} in Tracker")
     return known.to_si(1.0)
 
 
@@ -374,7 +365,7 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     if not known.any():
         return np.full(len(points), np.nan), ""
     if np.max(np.abs(points[known])) > LARGEST_NUMBER:
-        raise TrackError("holds a position too large to be one", "correct it")
+        raise InputError("holds a position too large to be one", "correct it")
     if points.shape[1] == 1:
         net = points[known][-1, 0] - points[known][0, 0]
         return (-points[:, 0], "Turned round so that position grows.") if net < 0 else (points[:, 0], "")
@@ -439,7 +430,7 @@ def _stops_dead(y: Floats, noise_m: float) -> int | None:
 def load_track(trial: Trial) -> Track:
     """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
     if trial.track is None:
-        raise TrackError("is blank", "this trial has a video, not a track")
+        raise InputError("is blank", "this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
     return with_pressure_trace(trial, flag_end_of_motion(trial, track))
 
@@ -450,8 +441,8 @@ def with_pressure_trace(trial: Trial, track: Track) -> Track:
         return track
     try:
         return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
-    except TrackError as error:
-        raise TrackError(f"pressure_trace {trial.pressure_trace.name} {error}") from None
+    except InputError as error:
+        raise InputError(f"pressure_trace {trial.pressure_trace.name} {error}") from None
 
 
 def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
@@ -460,27 +451,24 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
     (columns t, x, y or t and one coordinate, with or without a title above).
     """
     if path.suffix.lower() == ".trz":
-        raise TrackError("is a packed Tracker project", "unpack it and name the .trk inside")
-    try:
-        text = read_text(path)
-        if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
-            return read_project(text, point_mass, frames_used)
-        if point_mass:
-            raise TrackError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
-        lines = text.split("\n")[:20]  # title and remarks stand above the header of a text export (chosen)
-        named = [{_physics_tracker_column(cell)[0] for cell in re.split(r"[\t;,]", line)} for line in lines]
-        skip = next((i for i, names in enumerate(named) if "t" in names and names & {"x", "y"}), None)
-        table = parse_table(text, skip or 0)
-        is_export = skip is not None and "position_m" not in table.columns
-        track = read_export(table) if is_export else _read_positions(table)
-    except TableError as error:
-        raise TrackError(error.message, error.remedy) from None
+        raise InputError("is a packed Tracker project", "unpack it and name the .trk inside")
+    text = read_text(path)
+    if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
+        return read_project(text, point_mass, frames_used)
+    if point_mass:
+        raise InputError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
+    lines = text.split("\n")[:20]  # title and remarks stand above the header of a text export (chosen)
+    named = [{_physics_tracker_column(cell)[0] for cell in re.split(r"[\t;,]", line)} for line in lines]
+    skip = next((i for i, names in enumerate(named) if "t" in names and names & {"x", "y"}), None)
+    table = parse_table(text, skip or 0)
+    is_export = skip is not None and "position_m" not in table.columns
+    track = read_export(table) if is_export else _read_positions(table)
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
     before, after = rows < frames_used[0], rows > frames_used[1]
     if np.count_nonzero(~before & ~after) < FEWEST_POINTS:
-        raise TrackError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used", "widen it")
+        raise InputError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used", "widen it")
     flag = np.where(before, "rejected", np.where(after, "after_end", track.flag.astype("<U64")))
     return replace(track, flag=flag)
 
@@ -496,7 +484,7 @@ def _read_positions(table: Table) -> Track:
         sigma_m = table.numbers("sigma_m", blank_is_nan=True)
         if np.any(sigma_m < 0):
             line = table.lines[int(np.argmax(sigma_m < 0))]
-            raise TrackError(f"line {line}, column sigma_m is negative", "correct it")
+            raise InputError(f"line {line}, column sigma_m is negative", "correct it")
         if np.any(sigma_m == 0):
             notes.append("A sigma_m of 0 is taken as unknown.")
             sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
@@ -519,14 +507,11 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
         time_s, pressure_kPa = _tdms_trace(path)
         lines: Sequence[int] = range(1, len(time_s) + 1)
     else:
-        try:
-            table = read_table(path)
-            _require(table, "time_s", "pressure_kPa")
-            time_s, pressure_kPa, lines = table.numbers("time_s"), table.numbers("pressure_kPa"), table.lines
-        except TableError as error:
-            raise TrackError(error.message, error.remedy) from None
+        table = read_table(path)
+        _require(table, "time_s", "pressure_kPa")
+        time_s, pressure_kPa, lines = table.numbers("time_s"), table.numbers("pressure_kPa"), table.lines
     if len(time_s) == 0:
-        raise TrackError("has no rows", "write time_s and pressure_kPa of at least one reading")
+        raise InputError("has no rows", "write time_s and pressure_kPa of at least one reading")
     check_times(time_s, lines)
     check_pressure(pressure_kPa, lines)
     return time_s, 1000 * pressure_kPa
@@ -540,7 +525,7 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
     start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
     if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):
         message = f"runs from {time_s[0]:g} to {time_s[-1]:g} s, the track from {start:g} to {end:g} s"
-        raise TrackError(message, "shift one so that both share a clock")
+        raise InputError(message, "shift one so that both share a clock")
     outside = int(np.sum((track.time_s < time_s[0]) | (track.time_s > time_s[-1])))
     notes = track.notes
     if outside:
@@ -553,4 +538,4 @@ def _require(table: Table, *columns: str) -> None:
     if missing := [column for column in columns if column not in table.columns]:
         present = ", ".join(table.columns[:8]) or "none"
         message = f"lacks the column {missing[0]} (found: {present[:120]})"
-        raise TrackError(message, f"name its columns {', '.join(columns)}")
+        raise InputError(message, f"name its columns {', '.join(columns)}")
