@@ -88,10 +88,10 @@ def test_one_text_at_two_places_is_compiled_once(tmp_path):
         ("import numpy as np\n", "import numpy as np\nKIND = 'guess'\n"),
         ('"N/√m", 0.8', '"N/√m", 80.0'),
         ("bounds=(0.0, 10.0)", "bounds=(0.0, 10.0), zero=(0.0, 1.0)"),
-        ("bounds=(0.0, 10.0)", "bounds=10.0"),
+        ("def tail_force", "def breakpoints(rig, q):\n    return (rig.lenght,)\n\n\ndef tail_force"),
         ("bounds=(0.0, 10.0)", "plausible=10.0"),
         ("import numpy as np\n", "import numpy as np\nORDER = 'first'\n"),
-        ("import numpy as np\n", "import numpy as np\nNEEDS = 3\n"),
+        ("import numpy as np\n", "import numpy as np\nNEEDS = ('tube_mm',)\n"),
         ('Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),', "3,"),
     ],
 )

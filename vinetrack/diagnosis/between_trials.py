@@ -304,8 +304,6 @@ def _effect_of(difference: Difference) -> Effect:
         text=BETWEEN[difference.name].summary,
         parameters=drift or parameters,
         functions={},
-        needs=(),
-        worked=(),
         path=Path(difference.name),
     )
 

@@ -401,13 +401,9 @@ def _still_drifts(fit: Fit) -> Iterator[Remark]:
 # Stands for the rule in answer sets
 TAIL_SLACK = Effect(
     name="tail_slack",
-    kind="physical",
     summary="Tail slack: a tail cannot push.",
     text="Tail slack: a tail cannot push.\n\n    tension ≥ 0\n\nReduce it with a lighter payload or a higher pressure.",
-    parameters=(),
     functions=MappingProxyType({}),
-    needs=(),
-    worked=(),
     path=Path(__file__).resolve(),
 )
 

@@ -16,6 +16,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pydantic import ConfigDict
+
 from vinetrack.core.records import Trial
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 
@@ -132,6 +134,9 @@ REFERENCE_TRIAL = Trial(
 )  # fmt: skip
 
 
+_CHECKED = ConfigDict(revalidate_instances="always")  # The parts of an effect are checked with it
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of an effect that can be fitted.
@@ -143,6 +148,8 @@ class Parameter:
     plausible range. Values a `period` apart are equivalent. `slips` are sizes of a relative error that a common slip in
     the sheet causes, each with a description; such a size is plausible however large it is.
     """
+
+    __pydantic_config__ = _CHECKED
 
     name: str
     symbol: str
@@ -178,6 +185,8 @@ class Worked:
     their defaults.
     """
 
+    __pydantic_config__ = _CHECKED
+
     hook: str
     expected: float
     how: str
@@ -187,7 +196,7 @@ class Worked:
     rel: float = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Effect:
     """One term of the model, read from one file.
 
@@ -217,13 +226,13 @@ class Effect:
     """
 
     name: str
-    kind: str
+    kind: str = "physical"
     summary: str
     text: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Parameter, ...] = ()
     functions: Mapping[str, Callable[..., Any]]
-    needs: tuple[str, ...]
-    worked: tuple[Worked, ...]
+    needs: tuple[str, ...] = ()
+    worked: tuple[Worked, ...] = ()
     path: Path
     in_trace: bool = False  #: a pressure measured during growth already includes it
     replaces: tuple[str, ...] = ()  #: effects that it contains and that are inactive while it is in the model

@@ -10,34 +10,25 @@ import contextlib
 import difflib
 import hashlib
 import inspect
-import json
 import math
 import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
-from numbers import Real
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import Bend
-from vinetrack.core.tables import file_size, write_json
+from vinetrack.core.records import Bend, Trial
+from vinetrack.core.tables import file_size, write_text
 from vinetrack.core.terminal import table
-from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.effects._base import (
-    HOOKS,
-    KINDS,
-    REFERENCE_TRIAL,
-    Effect,
-    Parameter,
-    State,
-    TrialInputs,
-    Worked,
-)
+from vinetrack.core.units import BASE_EFFECTS, split_unit
+from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
 
 # ------------------------------------------------------------------------------
 # First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash.
@@ -46,41 +37,28 @@ PACKAGE = Path(__file__).resolve().parents[1]  # Files below this folder are not
 POLICY = "VINETRACK_OWN_EFFECTS"  # Environment variable: if `known`, own effects that never ran here are refused
 
 
-def memory_file() -> Path:
-    """Return the file that lists the user's effects that have run."""
-    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(state) / "vinetrack" / "own_effects.json"
-
-
-def first_run(path: Path) -> str:
-    """Announce an own effect that has not run before on standard error, and remember it."""
-    path = path.resolve()
-    if path.is_relative_to(PACKAGE) or not path.is_file():
-        return ""
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if digest in _known():
-        return ""
-    if os.environ.get(POLICY) == "known":
-        return f"has never run here (sha256 {digest}), and {POLICY} is `known`: read it, then run it once without that"
-    print(f"{path} (sha256 {digest}) runs for the first time: it is a program with your rights.", file=sys.stderr)
-    remember(path)
-    return ""
+def _trace(path: Path) -> Path:
+    """The file, named by the hash of an own effect's text, that is there once this text has run."""
+    state = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+    return Path(state, "vinetrack", "own_effects", hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def remember(path: Path) -> None:
     """Remember an own effect as known, because it was announced or written by this program."""
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with contextlib.suppress(OSError):
-        write_json(memory_file(), _known() | {digest: str(path.resolve())})
+        write_text(_trace(path), str(path.resolve()))
 
 
-def _known() -> dict[str, str]:
-    """Effects that have run, by the SHA-256 of their files; empty where the list cannot be read."""
-    try:
-        known = json.loads(memory_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError, RuntimeError):
-        return {}
-    return known if isinstance(known, dict) else {}
+def announce(path: Path) -> None:
+    """Announce an own effect that has not run before on standard error, and remember it."""
+    path = path.resolve()
+    if path.is_relative_to(PACKAGE) or os.access(trace := _trace(path), os.F_OK):
+        return
+    if os.environ.get(POLICY) == "known":
+        remedy = "read it, then run it once without that"
+        raise EffectError(f"{path}: has never run here (sha256 {trace.name}), and {POLICY} is `known`: {remedy}.")
+    print(f"{path} (sha256 {trace.name}) runs for the first time: it is a program with your rights.", file=sys.stderr)
+    remember(path)
 
 
 class EffectError(UserError, ValueError):
@@ -127,13 +105,14 @@ def load_effect(path: Path | str) -> Effect:
         raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.") from None
     except OSError as error:
         raise EffectError(f"{path}: this effect cannot be read: {error.strerror}.") from None
-    if refusal := first_run(path):
-        raise EffectError(f"{path}: {refusal}.")
+    announce(path)
     try:
         effect = _effect_of(_load_module(path), path)
         faults = list(_faults(effect))
     except EffectError:
         raise
+    except ValidationError as error:
+        faults = [f"{' '.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
     except Exception as error:
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
     if faults:
@@ -142,29 +121,24 @@ def load_effect(path: Path | str) -> Effect:
 
 
 def _effect_of(module: ModuleType, path: Path) -> Effect:
-    """The effect that a file defines, not yet checked."""
+    """The effect that a file defines: its names in capitals are fields of `Effect`, of which pydantic checks types."""
     # From the source, because from Python 3.13 on `__doc__` loses the indentation that marks the formula.
     text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
-    functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
     breakpoints = of_rig = getattr(module, "breakpoints", None)
     if of_rig is not None and len(inspect.signature(of_rig).parameters) == 1:
         breakpoints = lambda rig, *_: of_rig(rig)  # noqa: E731
-    return Effect(
-        name=path.stem,
-        kind=getattr(module, "KIND", "physical"),
-        summary=text.splitlines()[0].strip() if text else "",
-        text=text,
-        parameters=tuple(getattr(module, "PARAMETERS", ())),
-        functions=MappingProxyType(functions),
-        needs=tuple(getattr(module, "NEEDS", ())),
-        worked=tuple(getattr(module, "WORKED", ())),
-        path=path.resolve(),
-        in_trace=bool(getattr(module, "IN_TRACE", False)),
-        replaces=tuple(getattr(module, "REPLACES", ())),
-        order=int(getattr(module, "ORDER", 3)),
-        finite=bool(getattr(module, "FINITE", False)),
-        breakpoints=breakpoints,
-    )
+    capitals = {field.name.upper(): field.name for field in fields(Effect)}
+    given = {capitals[name]: value for name, value in vars(module).items() if name in capitals}
+    given |= {
+        "name": path.stem,
+        "summary": text.partition("\n")[0].strip(),
+        "text": text,
+        "functions": {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))},
+        "path": path.resolve(),
+        "breakpoints": breakpoints,
+    }
+    effect: Effect = TypeAdapter(Effect).validate_python(given)
+    return effect
 
 
 def _faults(effect: Effect) -> Iterable[str]:
@@ -176,34 +150,17 @@ def _faults(effect: Effect) -> Iterable[str]:
         yield f"defines none of the functions {', '.join(HOOKS)}"
     if not effect.text or not effect.formula:
         yield "the docstring must say what it is and show the formula on an indented line"
-    if not all(isinstance(parameter, Parameter) for parameter in effect.parameters):
-        yield "PARAMETERS must hold Parameter(...) entries"
-        return
-    if not all(isinstance(worked, Worked) for worked in effect.worked):
-        yield "WORKED must hold Worked(...) entries"
+    known = {split_unit(field.name)[0] for field in fields(Trial)}
+    if unknown := [column for column in effect.needs if split_unit(column)[0] not in known]:
+        yield f"NEEDS {unknown[0]}, which is no column of a sheet"
     expected = ["s", "rig", *(parameter.name for parameter in effect.parameters)]
     for hook, function in effect.functions.items():
         given = list(inspect.signature(function).parameters)
         if given != expected:
             yield f"{hook}({', '.join(given)}) must be {hook}({', '.join(expected)})"
-    for parameter in effect.parameters:
-        yield from _parameter_faults(parameter)
-
-
-def _parameter_faults(parameter: Parameter) -> Iterable[str]:
-    def are_numbers(pair: Any) -> bool:
-        return isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(end, Real) for end in pair)
-
-    name = parameter.name
-    if not (are_numbers(parameter.bounds) and are_numbers((parameter.default, parameter.zero))):
-        yield f"default and zero of {name} must be numbers, its bounds two, such as bounds=(0, 1)"
-    elif not (parameter.bounds[0] <= parameter.default <= parameter.bounds[1] or parameter.default == parameter.zero):
-        yield f"the default of {name} lies outside its bounds"
-    if parameter.plausible is not None and not are_numbers(parameter.plausible):
-        yield f"plausible of {name} must be two numbers, such as plausible=(0, 1)"
-    for slip in parameter.slips:
-        if not (isinstance(slip, tuple) and len(slip) == 2 and isinstance(slip[0], Real) and isinstance(slip[1], str)):
-            yield f"slips of {name} must be pairs of a size and what was done"
+    for one in effect.parameters:
+        if not (one.bounds[0] <= one.default <= one.bounds[1] or one.default == one.zero):
+            yield f"the default of {one.name} lies outside its bounds"
 
 
 @lru_cache(maxsize=1)
@@ -316,24 +273,20 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
 
 
 def behaviour_faults(effect: Effect) -> Iterator[str]:
-    """Check an effect against its file: compilation, worked numbers, and that it vanishes at `zero`. Functions are
+    """Check an effect against its file: that it runs, its worked numbers, and that it vanishes at `zero`. Functions are
     evaluated in motion, where every effect can act.
     """
-    for hook in effect.functions:
-        yield from _compile_faults(effect, hook, effect.path.read_bytes())
+    if fault := _fault_in_motion(effect, effect.path.read_bytes()):
+        yield fault
+    zero = {parameter.name: parameter.zero for parameter in effect.parameters}
+    at = ", ".join(f"{name} = {value:g}" for name, value in zero.items())
+    how = f"at {at} nothing should change; give what shapes the effect a `zero=` that can be evaluated"
     for worked in effect.worked:
         yield from _worked_faults(effect, worked)
-    if effect.parameters:
-        zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
-        for hook, function in effect.functions.items():
-            try:
-                value = float(function(_STATE, _RIG, *effect.zero))
-            except ArithmeticError as error:
-                yield f"{hook} fails at {zero} ({error}): give what shapes the effect a `zero=` that can be evaluated"
-                continue
-            unchanged = getattr(_STATE, field) if isinstance(field := HOOKS[hook], str) else field
-            if not math.isclose(value, unchanged, rel_tol=1e-9, abs_tol=1e-12):
-                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({unchanged:g})"
+    for hook in effect.functions if zero else ():
+        unchanged = getattr(_STATE, field) if isinstance(field := HOOKS[hook], str) else field
+        at_zero = Worked(hook, unchanged, how, _STATE._asdict(), _RIG._asdict(), zero, rel=1e-9)
+        yield from _worked_faults(effect, at_zero)
 
 
 def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
@@ -346,24 +299,30 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
             raise ValueError(f"there is no parameter {', '.join(sorted(unknown))}")
         value = float(effect.functions[worked.hook](state, rig, *(values | dict(worked.parameters)).values()))
     except (KeyError, ValueError, ArithmeticError) as error:
-        yield f"a worked number of {worked.hook} cannot be tried ({error})"
+        yield f"{worked.hook} cannot be tried ({error}): {worked.how}"
         return
     if not math.isclose(value, worked.expected, rel_tol=worked.rel, abs_tol=1e-12):
-        yield f"{worked.hook} gives {value:.6g} where worked out by hand it is {worked.expected:.6g} ({worked.how})"
+        yield f"{worked.hook} gives {value:.6g} where it should be {worked.expected:.6g} ({worked.how})"
 
 
 @lru_cache(maxsize=1024)
-def _compile_faults(effect: Effect, hook: str, _text: bytes) -> tuple[str, ...]:
-    """Compile a function like the kernel, without the runtime that allocates arrays; once for each text of its file."""
+def _fault_in_motion(effect: Effect, _text: bytes) -> str:
+    """Run the functions of an effect, then compiled like the kernel, without the runtime that allocates arrays; once
+    for each text of its file. What fails, and why; Python, unlike numba, names a field that there is not.
+    """
     from numba import njit
     from numba.core.errors import NumbaError
 
     flags: dict[str, Any] = {"_nrt": False}
+    values, hook = [parameter.default for parameter in effect.parameters], "breakpoints"
     try:
-        compiled = njit(**flags)(effect.functions[hook])
-        compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
+        if effect.breakpoints is not None:
+            list(map(float, effect.breakpoints(_RIG, *values)))
+        for hook, function in effect.functions.items():  # noqa: B007
+            function(_STATE, _RIG, *values)
+            njit(**flags)(function)(_STATE, _RIG, *values)
     except NumbaError:
-        return (f"{hook} cannot be compiled: it may use numbers, functions of math and numpy, and fields of s and rig",)
+        return f"{hook} cannot be compiled: it may use numbers, functions of math and numpy, and fields of s and rig"
     except Exception as error:
-        return (f"{hook} fails in motion ({type(error).__name__}: {error})",)
-    return ()
+        return f"{hook} fails in motion ({type(error).__name__}: {error})"
+    return ""
