@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +182,12 @@ class Track:
         """Mask, shape (n_frames,), of points that are measurements of the leading edge."""
         measured = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
         return measured & ~with_flag(self.flag, *UNUSABLE_FLAGS)
+
+    def flagged(self, rows: Indices | Bools | list[int], flags: str, *notes: str) -> Track:
+        """Return the track with flags, joined by `;`, added to some of its rows, and with more notes."""
+        flag = self.flag.astype("<U80")
+        flag[rows] = [join_flags(str(old), flags) for old in flag[rows]]
+        return replace(self, flag=flag, notes=(*self.notes, *notes))
 
 
 def plain_track(

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window, join_flags
+from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
@@ -74,10 +74,7 @@ def flag_rest(track: Track, release: Release) -> Track:
     """Flag every row before the release with `before_release`."""
     if not math.isfinite(release.time_s) or release.moving_from_start:
         return track
-    resting = track.time_s < release.time_s
-    flag = track.flag.astype(track.flag.dtype if track.flag.dtype.itemsize >= 320 else "<U80")
-    flag[resting] = [join_flags(str(old), "before_release") for old in flag[resting]]
-    return replace(track, flag=flag)
+    return track.flagged(track.time_s < release.time_s, "before_release")
 
 
 def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Indices, Track, join_flags, with_flag
+from vinetrack.core.records import Floats, Indices, Track, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
@@ -74,7 +74,7 @@ def _correct_timing(track: Track) -> Track:
     for before in np.flatnonzero((np.rint(frames) > 1) & ~with_flag(track.flag[1:], "gap")):
         missing = _frames_are(int(np.rint(frames[before])) - 1)
         note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
-        out = _mark(out, int(before) + 1, "gap", note)
+        out = out.flagged([int(before) + 1], "gap", note)
     noise_m, rho = _noise(out)
     out = _retime_known_copies(out, step_s, noise_m, rho)
     checked_to = 0
@@ -292,24 +292,17 @@ def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
     at_s, time_s = float(track.time_s[fault.row]), track.time_s.copy()
     if fault.kind == "stale":
         note = f"the frame at {at_s:.5g} s repeats the one before it and is left out"
-        return _mark(track, fault.row, "duplicate", note)
+        return track.flagged([fault.row], "duplicate", note)
     if fault.kind == "inserted":
         time_s[fault.row] -= step_s / 2
         time_s[fault.row + 1 :] -= step_s
         note = f"the frame at {at_s:.5g} s is an inserted copy: left out, later times moved back by one frame"
-        return _mark(replace(track, time_s=time_s), fault.row, "duplicate", note)
+        return replace(track, time_s=time_s).flagged([fault.row], "duplicate", note)
     time_s[fault.row :] += fault.missing * step_s
     note = (
         f"{_frames_are(fault.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
     )
-    return _mark(replace(track, time_s=time_s), fault.row, "gap;retimed", note)
-
-
-def _mark(track: Track, row: int, flags: str, note: str) -> Track:
-    """The track with flags added to one row and a sentence to its notes."""
-    flag = track.flag.astype("<U80")
-    flag[row] = join_flags(str(flag[row]), flags)
-    return replace(track, flag=flag, notes=(*track.notes, note))
+    return replace(track, time_s=time_s).flagged([fault.row], "gap;retimed", note)
 
 
 def mean_speed(track: Track) -> float:

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import InputError
-from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
-from vinetrack.core.units import UNITS, convert, split_unit
+from vinetrack.core.units import UNITS, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
 
 
 def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
-    """Times, s, and gauge pressures, kPa, of a TDMS file: channels `time_s` and `pressure_kPa`. Their unit stands in
+    """Times, s, and gauge pressures, Pa, of a TDMS file: channels `time_s` and `pressure_kPa`. Their unit stands in
     the name, or beside it (`unit_string`). Where none is a time, the waveform's start and increment give it.
     """
     try:
@@ -154,26 +154,14 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
         there = ", ".join(list(named)[:8]) or "none"
         raise InputError(f"lacks a channel pressure_kPa (found: {there[:120]})", "name it so in LabVIEW")
     properties, samples = named[pressure]
-    pressure_kPa: Floats = _in_unit(pressure, samples, "kPa")
+    pressure_Pa: Floats = samples * _factor(split_unit(pressure)[1], "Pa")
     for name, (_, values) in named.items():
         if name.startswith("time") and len(values) == len(samples):
-            return _in_unit(name, values, "s"), pressure_kPa
+            return values * _factor(split_unit(name)[1], "s"), pressure_Pa
     step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
     if not step > 0:
         raise InputError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
-    return start + step * np.arange(len(samples), dtype=float), pressure_kPa
-
-
-def _in_unit(name: str, values: np.ndarray, wanted: str) -> Floats:
-    """The samples of a channel in the unit wanted, from the unit at the end of its name."""
-    unit = split_unit(name)[1]
-    if not unit or not np.all(np.isfinite(values)):
-        fault = "holds a sample that is no number" if unit else "states no unit"
-        raise InputError(f"channel {name[:40]} {fault}", "correct it in LabVIEW")
-    try:
-        return np.asarray(values, dtype=float) * (1.0 if unit == wanted else convert(1.0, unit, wanted))
-    except ValueError as error:
-        raise InputError(f"channel {name}: {error}") from None
+    return start + step * np.arange(len(samples), dtype=float), pressure_Pa
 
 
 # ------------------------------------------------------------------------------
@@ -353,7 +341,7 @@ def _factor(unit: str, si: str) -> float:
     known = UNITS.get(unit.replace("µ", "u"))
     if known is None or known.si != si:
         others = ", ".join(key for key, other in UNITS.items() if other.si == si)
-        raise InputError(f"has an unknown unit {unit[:20]!r}", f"use one of {others} in Tracker")
+        raise InputError(f"has an unknown unit {unit[:20]!r}", f"use one of {others}")
     return known.to_si(1.0)
 
 
@@ -406,11 +394,9 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
         end = end - 1 if np.median(y[-3:]) - np.median(y[:3]) < END_FRACTION * trial.length_m else None
     if end is None or end + 1 < FEWEST_POINTS:
         return track
-    flag = track.flag.astype("<U80")
-    flag[rows[end + 1 :]] = [join_flags(str(old), "after_end") for old in flag[rows[end + 1 :]]]
     who, end_s = "vine" if is_vine else "body", track.time_s[rows[end]]
     note = f"the {who} {what} after {end_s:.5g} s: the end of its motion; later points are not used"
-    return replace(track, flag=flag, notes=(*track.notes, note))
+    return track.flagged(rows[end + 1 :], "after_end", note)
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
@@ -469,8 +455,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
     before, after = rows < frames_used[0], rows > frames_used[1]
     if np.count_nonzero(~before & ~after) < FEWEST_POINTS:
         raise InputError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used", "widen it")
-    flag = np.where(before, "rejected", np.where(after, "after_end", track.flag.astype("<U64")))
-    return replace(track, flag=flag)
+    return track.flagged(before, "rejected").flagged(after, "after_end")
 
 
 def _read_positions(table: Table) -> Track:
@@ -504,17 +489,19 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
     and gauge pressures in Pa, two arrays, shape (n,).
     """
     if path.suffix.lower() == ".tdms":
-        time_s, pressure_kPa = _tdms_trace(path)
+        time_s, pressure_Pa = _tdms_trace(path)
         lines: Sequence[int] = range(1, len(time_s) + 1)
     else:
         table = read_table(path)
         _require(table, "time_s", "pressure_kPa")
-        time_s, pressure_kPa, lines = table.numbers("time_s"), table.numbers("pressure_kPa"), table.lines
+        time_s, pressure_Pa, lines = table.numbers("time_s"), 1000 * table.numbers("pressure_kPa"), table.lines
     if len(time_s) == 0:
         raise InputError("has no rows", "write time_s and pressure_kPa of at least one reading")
+    if not np.isfinite(time_s + pressure_Pa).all():
+        raise InputError("holds a sample that is no number", "correct it in LabVIEW")
     check_times(time_s, lines)
-    check_pressure(pressure_kPa, lines)
-    return time_s, 1000 * pressure_kPa
+    check_pressure(pressure_Pa / 1000, lines)
+    return time_s, pressure_Pa
 
 
 def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:

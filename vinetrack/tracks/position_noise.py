@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, join_flags, with_flag
+from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, with_flag
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -393,13 +393,13 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     time_from_point = time_s[places] - time_s[:, None]
     width = np.abs(time_from_point).max(axis=1)
     relative_time = time_from_point / width[:, None]
-    powers = np.polynomial.polynomial.polyvander(relative_time, 6)
+    powers = relative_time[..., None] ** np.arange(4)
     y = position_m[places] - position_m[:, None]
     smallest_scale = np.maximum(noise_m, 1e-9 * np.ptp(position_m))
     weight = np.ones_like(y)
     for turn in range(10):
-        coefficients = _normal_solution(powers, weight, _sums(powers[..., :4], weight * y))
-        residuals = np.abs(y - _cubic(powers, coefficients))
+        coefficients = _normal_solution(powers, weight, np.einsum("wip,wi->wp", powers, weight * y))
+        residuals = np.abs(y - np.einsum("wip,wp->wi", powers, coefficients))
         if turn < 6:  # least absolute residuals
             weight = 1 / np.maximum(residuals, 0.1 * smallest_scale)
         else:  # Tukey's biweight; the median of 12 residuals about 4 fitted numbers is 0.55 of their sd
@@ -411,7 +411,7 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     used = np.maximum(on_cubic.sum(axis=1), 5)
     # The point itself lies at 0, where the cubic is its first coefficient.
     first_coefficient = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    leverage = weight * _cubic(powers, _normal_solution(powers, weight, first_coefficient))
+    leverage = weight * np.einsum("wip,wp->wi", powers, _normal_solution(powers, weight, first_coefficient))
     # Of the 4 nearest neighbours, 3 must lie on the cubic too (`_outlying`).
     nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :4]
     return LocalFit(
@@ -469,11 +469,8 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
     outlying = outlying[~with_flag(track.flag[outlying], "corrected")] if outlying.size else outlying
     if not outlying.size:
         return track
-    flag = track.flag.astype("<U80")
-    flag[outlying] = [join_flags(str(old), "rejected") for old in flag[outlying]]
-    rejected = replace(track, flag=flag)
-    note = f"far off the motion around, so left out: {', '.join(_places(rejected, outlying))}"
-    return replace(rejected, notes=(*track.notes, note))
+    places = _places(rejected := track.flagged(outlying, "rejected"), outlying)
+    return rejected.flagged([], "", f"far off the motion around, so left out: {', '.join(places)}")
 
 
 def rejected_points_note(tracks: Mapping[str, Track]) -> str:
@@ -522,24 +519,14 @@ def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bo
     return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated & (sigma_m > 0))
 
 
-def _sums(powers: Floats, weight: Floats) -> Floats:
-    """Weighted sums of powers over each window, shape (n_windows, n_powers)."""
-    return np.asarray(np.matmul(weight[:, None, :], powers)[:, 0])
-
-
-def _cubic(powers: Floats, coefficients: Floats) -> Floats:
-    """The cubic of each window at its places, shape (n_windows, n_places)."""
-    return np.asarray((powers[..., :4] @ coefficients[..., None])[..., 0])
-
-
 def _normal_solution(powers: Floats, weight: Floats, right: Floats) -> Floats:
     """Coefficients, (n_windows, 4), of weighted least squares with these right sides of the normal equations, which are
-    scaled to a unit diagonal, with a ridge of 1e-10.
+    scaled to a unit diagonal, with a ridge of 1e-10. Shapes: powers (n_windows, n_places, 4).
     """
-    sums = _sums(powers, weight)
-    scale = 1 / np.sqrt(sums[:, ::2])
-    normal = sums[:, np.add.outer(np.arange(4), np.arange(4))] * scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.solve(normal + 1e-10 * np.eye(4), (right * scale)[..., None])[..., 0] * scale)
+    normal = np.swapaxes(powers * weight[..., None], 1, 2) @ powers
+    scale = 1 / np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
+    scaled = normal * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(4)
+    return np.asarray(np.linalg.solve(scaled, (right * scale)[..., None])[..., 0] * scale)
 
 
 # ------------------------------------------------------------------------------
@@ -589,7 +576,8 @@ def noise_shape(
     # The noise of a trial is estimated from 20 fourth differences or more.
     if min(int(part.use.sum()) for part in differences) < 20:
         return None
-    equal_noise = sum(_best_scale(part, np.zeros_like(part.speed_m_s))[0] for part in differences)
+    squares = [part.distance_m[part.use] ** 2 for part in differences]
+    equal_noise = sum(square.size * (math.log(float(np.mean(square))) + 1) for square in squares)
     shapes = [result for result in (_by_speed(differences), _as_stated(differences, stated_m)) if result is not None]
     if not shapes:
         return None
@@ -629,41 +617,23 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     return _Differences(winsorised_m, use, np.median(speeds, axis=1))
 
 
-def _best_scale(differences: _Differences, extra_m: Floats) -> tuple[float, float]:
-    """−2 ln L of a trial's differences with sd² = s² + extra², minimised over s, and that s. Every fifth s is tried,
-    then those about the best of them: −2 ln L has one valley.
-    """
-    coarse_step = 5  # Every fifth value of s is tried before those between (chosen)
-    square, extra_square = differences.distance_m[differences.use] ** 2, extra_m[differences.use] ** 2
-    typical = math.sqrt(float(np.mean(square))) + 1e-300
-    s = typical * np.geomspace(1 / 30, 2.0, 61)  # by factors of 1.12 (derived)
-    indices = np.arange(0, s.size, coarse_step)
-    for _ in range(2):
-        variance = s[indices, None] ** 2 + extra_square
-        deviances = np.sum(np.log(variance) + square / variance, axis=1)
-        best = int(np.argmin(deviances))
-        deviance, k = float(deviances[best]), int(indices[best])
-        indices = np.arange(max(k - coarse_step + 1, 0), min(k + coarse_step, s.size))
-    return deviance, float(s[k])
-
-
 def _by_speed(differences: Sequence[_Differences]) -> tuple[float, NoiseShape] | None:
-    """−2 ln L at the most likely τ of all trials together, and the standard deviations."""
-    speed = float(np.median([np.quantile(part.speed_m_s[part.use], 0.9) for part in differences]))
-    noise = float(np.median([np.median(part.distance_m[part.use]) for part in differences])) / 0.6745
-    if not (speed > 0 and noise > 0):
+    """−2 ln L of noise with the most likely τ of all trials together and s of each, and the standard deviations. Both
+    maximise it by the updates of `_whittle`.
+    """
+    trial = np.repeat(np.arange(len(differences)), [np.count_nonzero(part.use) for part in differences])
+    square = np.concatenate([part.distance_m[part.use] for part in differences]) ** 2
+    speed_square = np.concatenate([part.speed_m_s[part.use] for part in differences]) ** 2
+    if not (speed_square.any() and square.any()):
         return None
-    # By factors of 1.19 about what makes both parts equal at the higher speeds; then refined by a parabola (derived)
-    grid = noise / speed * np.geomspace(1 / 30, 30.0, 41)
-    deviances = np.array([sum(_best_scale(part, blur * part.speed_m_s)[0] for part in differences) for blur in grid])
-    k = int(np.argmin(deviances))
-    blur = float(grid[k])
-    if 0 < k < grid.size - 1:
-        low, mid, high = deviances[k - 1 : k + 2]
-        blur *= float((grid[1] / grid[0]) ** (0.5 * (low - high) / (low - 2 * mid + high)))
-    fits = [_best_scale(part, blur * part.speed_m_s) for part in differences]
-    sd_m = tuple(np.hypot(s, blur * part.speed_m_s) for (_, s), part in zip(fits, differences, strict=True))
-    return sum(level for level, _ in fits), NoiseShape(sd_m, blur)
+    still, blur = np.bincount(trial, square) / np.bincount(trial), float(np.sum(square) / np.sum(speed_square))
+    for _ in range(300):
+        variance = still[trial] + blur * speed_square
+        still = still * np.sqrt(np.bincount(trial, square / variance**2) / np.bincount(trial, 1 / variance))
+        blur *= math.sqrt(float(speed_square @ (square / variance**2)) / float(speed_square @ (1 / variance)))
+    variance = still[trial] + blur * speed_square
+    sd_m = tuple(np.sqrt(part_s + blur * part.speed_m_s**2) for part_s, part in zip(still, differences, strict=True))
+    return float(np.sum(np.log(variance) + square / variance)), NoiseShape(sd_m, math.sqrt(blur))
 
 
 def _as_stated(
