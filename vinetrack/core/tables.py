@@ -181,29 +181,23 @@ def parse_number(text: str, decimal: str = ".") -> float:
 def read_bytes(path: Path) -> bytes:
     """Read a file that is no recording."""
     try:
-        is_small = file_size(path) <= MAX_TABLE_BYTES
-        data = path.read_bytes() if is_small else b""
+        if file_size(path) <= MAX_TABLE_BYTES:
+            return path.read_bytes()
     except FileNotFoundError:
         raise InputError(*missing_file_message(path)) from None
     except (OSError, ValueError) as error:
         raise InputError("cannot be read", getattr(error, "strerror", None) or "it cannot be opened") from None
-    if not is_small:
-        raise InputError("is too large to be a table", "is it a recording?")
-    return data
+    raise InputError("is too large to be a table", "is it a recording?")
 
 
 def read_text(path: Path) -> str:
     r"""Read a text file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
     data = read_bytes(path)
-    if data.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
-        encodings = ["utf-32"]
-    elif data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encodings = ["utf-16"]
-    elif b"\x00" in data:
-        raise InputError("is not text", "save the table as CSV (comma or semicolon separated)")
-    else:
-        encodings = ["utf-8-sig", "cp1252"]
-    for encoding in encodings:
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
+    if b"\x00" in data and not is_wide:
+        raise InputError("is not text", "save the table as CSV in UTF-8")
+    # Two characters of UTF-16 are none of UTF-32, whose mark begins with that of UTF-16.
+    for encoding in ("utf-32", "utf-16") if is_wide else ("utf-8-sig", "cp1252"):
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
     raise InputError("is not readable as text", "save it as CSV in UTF-8")

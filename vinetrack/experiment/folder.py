@@ -101,7 +101,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     absent: set[str] = set()
     in_use = [row for row in rows if row.in_use]
     for row in in_use:
-        row.check(folder)
+        row.check()
         # A value that the sheet lacks may stand in the settings, so this needs readable settings.
         absent |= row.find_missing(folder, table.columns) if table and settings else set()
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
@@ -141,11 +141,6 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     except ExperimentError as error:
         problems += error.problems
         return None
-    for key, relative in settings.paths:
-        try:
-            tables.safe_join(folder, relative)
-        except InputError as error:
-            problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
         if said := COLUMNS[name].unusual(value):
@@ -410,7 +405,8 @@ def _check_track(trial: Trial) -> list[Problem]:
     # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
     if travel_m > 2 * trial.length_m:
         remarks["longer_than_the_vine"] = (
-            f"travels {travel_m:.4g} m, but the vine is {trial.length_m:g} m long: are its positions in metres?"
+            f"travels {travel_m:.4g} m, but the vine is {1000 * trial.length_m:g} mm long by the sheet: is length_mm "
+            "in millimetres, and are the positions in metres?"
         )
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
         remarks["backwards"] = "runs backwards: position should grow as the vine does"

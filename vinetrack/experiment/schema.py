@@ -21,7 +21,7 @@ from typing import Any
 
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import Bend, PictureAxis, Trial
-from vinetrack.core.tables import parse_number
+from vinetrack.core.tables import parse_number, safe_join
 from vinetrack.core.units import NO_UNIT, UNITS, Unit, convert, split_unit
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
@@ -91,7 +91,10 @@ class Column:
         """Return the value of a non-blank cell, in the unit of its column."""
         try:
             match self.kind:
-                case "text" | "path":
+                case "text":
+                    return text
+                case "path":
+                    safe_join(Path(), text)
                     return text
                 case "yes_no":
                     if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):

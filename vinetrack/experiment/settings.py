@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, Union, get_args, g
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
-from pydantic.functional_validators import BeforeValidator, field_validator, model_validator
+from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
@@ -35,6 +35,7 @@ def _no_yes_or_no(value: Any) -> Any:
     return value
 
 
+InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
 Number = Annotated[float, BeforeValidator(_no_yes_or_no)]
 Count = Annotated[int, BeforeValidator(_no_yes_or_no)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -101,7 +102,7 @@ class TwoPoints(_TwoEnds):
 class Board(_Strict):
     """A printed target."""
 
-    image: Annotated[str, "Film it with the settings of the trials."]
+    image: Annotated[InFolder, "Film it with the settings of the trials."]
     """Picture or clip of the target, in the plane of growth."""
     squares: Annotated[tuple[Annotated[Count, Field(ge=2)], Annotated[Count, Field(ge=2)]], "Count them."]
     """Squares across and down."""
@@ -199,7 +200,7 @@ class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
     """Effects of the model in use."""
     candidates: tuple[str, ...] | None = None
     """Effects that a diagnosis may propose; blank for the whole catalogue."""
-    effects: tuple[str, ...] = ()
+    effects: tuple[InFolder, ...] = ()
     """Paths of Python files with effects of your own."""
     strict: bool = False
     """Whether a fault of one trial stops the whole experiment."""

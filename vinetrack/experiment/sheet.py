@@ -44,6 +44,11 @@ class Row:
         return {problem.column for problem in self.problems if problem.severity == "error"}
 
     @property
+    def given(self) -> set[str]:
+        """Columns that have a value, or an error."""
+        return {*self.values, *self.faulty}
+
+    @property
     def in_use(self) -> bool:
         """Whether the trial is to be analysed; False for `use: no`."""
         return bool(self.values.get("use", True))
@@ -70,21 +75,16 @@ class Row:
         """Report required columns that have no value, unless another problem already concerns them."""
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
         for name in columns:
-            if name not in {*self.values, *self.faulty}:
+            if name not in self.given:
                 self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
-    def check(self, folder: Path) -> None:
-        """Check the row as a whole: one recording or track, paths inside the folder, values that agree."""
-        for name in ("video", "track", "pressure_trace"):
-            if name in self.values:
-                try:
-                    safe_join(folder, self.values[name])
-                except InputError as error:
-                    self.add_error(error, name, self.values[name])
-        if "video" in self.values and "track" in self.values:
+    def check(self) -> None:
+        """Check the row as a whole: one recording or track, values that agree."""
+        given = self.given
+        if {"video", "track"} <= given:
             message, remedy = "has both a video and a track", "keep one of the two"
-            self.add("two_recordings", message, "track", value=self.values["track"], remedy=remedy)
-        elif "video" not in self.values and "track" not in self.values:
+            self.add("two_recordings", message, "track", value=self.values.get("track"), remedy=remedy)
+        elif not {"video", "track"} & given:
             remedy = "name a recording under video, or a file of positions under track"
             self.add("no_recording", "has neither a video nor a track", remedy=remedy)
         self.check_wall()
@@ -102,7 +102,7 @@ class Row:
         if "travel_ratio" in self.faulty:
             return set()
         required = list(REQUIRED_COLUMNS if self.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
-        if "pressure_kPa" in required and ("pressure_trace" in self.values or "track" in self.values):
+        if "pressure_kPa" in required and {"pressure_trace", "track"} & self.given:
             required.remove("pressure_kPa")
         self.add_blank([name for name in required if name in columns])
         if "video" in self.values and "track" not in self.values and not _may_state_rate(folder, self.values["video"]):

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem
+from vinetrack.core.problems import Problem
 from vinetrack.core.tables import safe_join, write_text
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import check_needs, make_model
@@ -41,10 +41,7 @@ def describe_effects(name: str | None, experiment: Path | None) -> tuple[list[st
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
     """Load and test the user's own effects of an experiment."""
     settings = read_experiment_settings(experiment / "experiment.yaml")
-    try:
-        return own_effects([safe_join(experiment, path) for path in settings.effects])
-    except InputError as error:
-        raise ExperimentError([Problem(message=str(error), file="experiment.yaml", column="effects")]) from None
+    return own_effects([safe_join(experiment, path) for path in settings.effects])
 
 
 def model_problems(experiment: Experiment) -> list[Problem]:
