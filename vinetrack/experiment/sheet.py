@@ -296,7 +296,9 @@ def planned_trial(
     '24mm-200um-280mm'
     """
     table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
-    return _planned(table, settings or ExperimentSettings(), needed)
+    settings = settings or ExperimentSettings()
+    trials, warnings = trials_of_rows(table, settings, needed)
+    return PlannedTrials(trials, settings, None, warnings)
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
@@ -314,10 +316,10 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
         header.append(Problem("missing", f"has no column {', '.join(absent)}", file=file.name, remedy=remedy))
     if absent or not table.rows:
         raise ExperimentError(header)
-    planned = _planned(table, settings, REQUIRED_FOR_PREDICTION, header, file.name)
-    first = {trial.condition: trial for trial in reversed(planned.trials)}
-    trials = [trial for trial in planned.trials if every_row or trial is first[trial.condition]]
-    return replace(planned, trials=tuple(trials), folder=file.parent)
+    trials, warnings = trials_of_rows(table, settings, REQUIRED_FOR_PREDICTION, header, file.name)
+    first = {trial.condition: trial for trial in reversed(trials)}
+    shown = tuple(trial for trial in trials if every_row or trial is first[trial.condition])
+    return PlannedTrials(shown, settings, file.parent, warnings)
 
 
 def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
@@ -326,31 +328,38 @@ def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
     return Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
 
 
-def _planned(
-    table: Table, settings: ExperimentSettings, needed: Sequence[str], header: Sequence[Problem] = (), file: str = ""
-) -> PlannedTrials:
-    """Check the rows in use, and make named trials of them without their recordings, unless there is an error; a yield
-    pressure that is not given is NaN. Problems name the sheet, or without a file the options.
+def trials_of_rows(
+    table: Table,
+    settings: ExperimentSettings,
+    needed: Sequence[str],
+    header: Sequence[Problem] = (),
+    file: str = "",
+    *,
+    measured: bool = False,
+) -> tuple[tuple[Trial, ...], tuple[Problem, ...]]:
+    """Check the rows in use, and make named trials of them without their recordings, unless there is an error. A
+    yield pressure that is not given is NaN, and all are vines; unless they are `measured`. Problems name the sheet, or
+    without a file the options. Returns the trials and warnings.
     """
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     remedy = "remove `use: no` from at least one row"
     problems = [] if rows else [Problem("no_rows", "has no trial in use", remedy=remedy)]
     for row in rows:
-        row.add_blank(needed, "give it")
-        if row.travel_ratio != 2:
+        is_body = row.travel_ratio != 2
+        row.add_blank(needed[:1] if is_body and measured else needed, "give it")
+        if is_body and not measured:
             remedy = "predictions are for everting vines (travel_ratio 2)"
             row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
         row.check_wall()
         row.check_pressures()
-        problems += [problem for problem in row.problems if problem.column not in _RECORDING_COLUMNS]
+        problems += [problem for problem in row.problems if measured or problem.column not in _RECORDING_COLUMNS]
     if not file:
         problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]
     problems = [*header, *(replace(problem, file=file) for problem in problems)]
     if any(problem.severity == "error" for problem in problems):
         raise ExperimentError(problems)
-    for row in rows:
+    for row in rows if not measured else ():
         row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
         if "yield_pressure_kPa" not in row.values:
             row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
-    trials = with_names([make_trial(row, Path(), settings) for row in rows])
-    return PlannedTrials(trials, settings, None, tuple(problems))
+    return with_names([make_trial(row, Path(), settings) for row in rows]), tuple(problems)

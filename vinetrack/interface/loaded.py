@@ -27,9 +27,8 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
-from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, make_trial, read_row, table_of_texts
+from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, table_of_texts, trials_of_rows
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
@@ -232,9 +231,10 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
     if absent:
         remedy = "a frame of tracks has trial, time_s, lead_position_m and the columns of a trial sheet"
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
-    parts = [(str(name), part) for name, part in frame.groupby("trial", sort=False)]
-    trials = _trials([_cells(name, part) for name, part in parts])
-    return [(trial, _track(trial, part, position)) for trial, (_, part) in zip(trials, parts, strict=True)]
+    parts = {str(name): part for name, part in frame.groupby("trial", sort=False)}
+    table, _ = in_sheet_units(table_of_texts([_cells(name, part) for name, part in parts.items()]), "the frame")
+    trials, _ = trials_of_rows(table, ExperimentSettings(), REQUIRED_FOR_PREDICTION, file="the frame", measured=True)
+    return [(trial, _track(trial, parts[trial.name], position)) for trial in trials]
 
 
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
@@ -250,27 +250,6 @@ def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
             raise ExperimentError([Problem(message=message, file="the frame", column=str(column), remedy=remedy)])
         cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
     return cells
-
-
-def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
-    table, _ = in_sheet_units(table_of_texts(rows), "the frame")
-    settings = ExperimentSettings()
-    problems: list[Problem] = []
-    trials = []
-    for i in range(len(rows)):
-        row = read_row(table, i, settings)
-        required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
-        row.add_blank(required, "give it as a column of the frame")
-        row.check_wall()
-        row.check_pressures()
-        problems += [replace(problem, file="the frame") for problem in row.problems]
-        if not row.faulty:
-            # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
-            row.values["track"] = row.name
-            trials.append(replace(make_trial(row, Path(), settings), track=None))
-    if any(problem.severity == "error" for problem in problems):
-        raise ExperimentError(problems)
-    return list(with_names(trials))
 
 
 def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
