@@ -30,7 +30,7 @@ _HOMES = {
     "fit": "vinetrack.interface.loaded",
     "load": "vinetrack.interface.loaded",
     "make_model": "vinetrack.dynamics.model",
-    "planned_trial": "vinetrack.experiment.sheet",
+    "planned_trial": "vinetrack.experiment.folder",
     "power": "vinetrack.interface.loaded",
     "predict": "vinetrack.inference.fit",
     "predict_vine": "vinetrack.planning.prediction",

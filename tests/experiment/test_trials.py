@@ -11,8 +11,8 @@ from vinetrack.core.problems import ExperimentError, InputError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
 from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment import folder
+from vinetrack.experiment.folder import planned_sheet, planned_trial
 from vinetrack.experiment.schema import COLUMNS, with_names
-from vinetrack.experiment.sheet import planned_sheet, planned_trial
 from vinetrack.tracks.importers import load_track, read_track
 
 

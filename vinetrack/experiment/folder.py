@@ -22,7 +22,7 @@ import vinetrack
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
-from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, with_names
+from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
 from vinetrack.tracks.importers import load_track, read_pressure_trace, read_track
@@ -214,6 +214,112 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
         remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, below zero"
         return row.add("blank", "is blank", "pressure_kPa", value="", remedy=remedy)
     row.values["pressure_kPa"] = nominal_kPa
+
+
+# ------------------------------------------------------------------------------
+# Planned trials: one given by command-line options, or the rows of a sheet, with or without recordings.
+#
+# Both pass the checks of a trial sheet, so that a wrong unit gets the same message everywhere.
+
+# Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior
+REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
+
+# Columns about recordings: optional for a planned trial, and ignored but for the rate
+_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
+
+
+def planned_trial(
+    values: Mapping[str, str],
+    settings: ExperimentSettings | None = None,
+    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
+) -> Experiment:
+    """Read a trial from texts by name of column, as given on the command line.
+
+    A yield pressure that is not given is NaN. Messages name the command-line option.
+
+    Parameters
+    ----------
+    values : texts by column, in the unit of the column.
+    settings : shared settings; None for the defaults.
+    needed : required columns.
+
+    Returns
+    -------
+    planned : an experiment of that trial, and warnings.
+
+    Raises
+    ------
+    ExperimentError
+        With every value that is missing or not allowed.
+
+    Examples
+    --------
+    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
+    >>> planned_trial(texts).trials[0].vine
+    '24mm-200um-280mm'
+    """
+    table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
+    return planned_rows(table, settings or ExperimentSettings(), needed)
+
+
+def planned_sheet(path: Path, *, every_row: bool = False) -> Experiment:
+    """Read the conditions in use of a folder or sheet, filmed or not: the first row of each, or `every_row`."""
+    file = path / SHEET if path.is_dir() else path
+    if not file.is_file():
+        close = closest_entry(file)
+        remedy = f"did you mean {close}?" if close else f"give a folder with {SHEET}, or a sheet"
+        raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
+    table, header = read_sheet(file)
+    settings = read_experiment_settings(file.parent / "experiment.yaml")
+    given = {*table.columns, *(name for name in SHARED if getattr(settings, name) is not None)}
+    if absent := [name for name in REQUIRED_FOR_PREDICTION if name not in given]:
+        remedy = "give a trial sheet, one row a trial, with these columns"
+        header.append(Problem("missing", f"has no column {', '.join(absent)}", file=file.name, remedy=remedy))
+    if absent or not table.rows:
+        raise ExperimentError(header)
+    planned = planned_rows(table, settings, REQUIRED_FOR_PREDICTION, header, file)
+    first = {trial.condition: trial for trial in reversed(planned.trials)}
+    shown = tuple(trial for trial in planned.trials if every_row or trial is first[trial.condition])
+    return replace(planned, trials=shown)
+
+
+def table_of_texts(rows: Sequence[dict[str, str]]) -> tables.Table:
+    """Return a table of rows that stand in no file: their lines are 0."""
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    return tables.Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
+
+
+def planned_rows(
+    table: tables.Table, settings: ExperimentSettings, needed: Sequence[str], header: Sequence[Problem] = (),
+    file: Path = Path(), *, measured: bool = False,
+) -> Experiment:  # fmt: skip
+    """Check the rows in use, and make an experiment of them without their recordings, unless there is an error. A yield
+    pressure that is not given is NaN, and all are vines, unless they are `measured`. Problems name the sheet, or
+    without a file the options.
+    """
+    rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
+    remedy = "remove `use: no` from at least one row"
+    problems = [] if rows else [Problem("no_rows", "has no trial in use", remedy=remedy)]
+    for row in rows:
+        is_body = row.travel_ratio != 2
+        row.add_blank(needed[:1] if is_body and measured else needed, "give it")
+        if is_body and not measured:
+            remedy = "predictions are for everting vines (travel_ratio 2)"
+            row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
+        row.check_wall()
+        row.check_pressures()
+        problems += [problem for problem in row.problems if measured or problem.column not in _RECORDING_COLUMNS]
+    if not file.name:
+        problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]
+    problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
+    if any(problem.severity == "error" for problem in problems):
+        raise ExperimentError(problems)
+    for row in rows if not measured else ():
+        row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
+        if "yield_pressure_kPa" not in row.values:
+            row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
+    trials = with_names([make_trial(row, Path(), settings) for row in rows])
+    return Experiment("planned", file.parent, settings, trials, problems=tuple(problems))
 
 
 # ------------------------------------------------------------------------------

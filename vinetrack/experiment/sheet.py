@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,8 @@ from typing import Any
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, read_table, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, option, with_names
-from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units, read_experiment_settings
+from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
 SHEET = "trials.csv"
 
@@ -241,125 +241,3 @@ def expected_systematic_m(settings: ExperimentSettings, scaled_elsewhere: bool =
         return settings.position_systematic_mm / 1e3
     known = isinstance(settings.calibration, Board) and not scaled_elsewhere
     return 0.0 if known else math.nan
-
-
-# ------------------------------------------------------------------------------
-# Planned trials: one given by command-line options, or the rows of a sheet, with or without recordings.
-#
-# Both pass the checks of a trial sheet, so that a wrong unit gets the same message everywhere.
-
-# Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior
-REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
-
-# Columns about recordings: optional for a planned trial, and ignored but for the rate
-_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
-
-
-@dataclass(frozen=True)
-class PlannedTrials:
-    """Planned trials, one per condition or one per row, with the settings they share; `problems` are warnings."""
-
-    trials: tuple[Trial, ...]
-    settings: ExperimentSettings
-    folder: Path | None
-    problems: tuple[Problem, ...]
-
-
-def planned_trial(
-    values: Mapping[str, str],
-    settings: ExperimentSettings | None = None,
-    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
-) -> PlannedTrials:
-    """Read a trial from texts by name of column, as given on the command line.
-
-    A yield pressure that is not given is NaN. Messages name the command-line option.
-
-    Parameters
-    ----------
-    values : texts by column, in the unit of the column.
-    settings : shared settings; None for the defaults.
-    needed : required columns.
-
-    Returns
-    -------
-    planned : the trial, and warnings.
-
-    Raises
-    ------
-    ExperimentError
-        With every value that is missing or not allowed.
-
-    Examples
-    --------
-    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
-    >>> planned_trial(texts).trials[0].vine
-    '24mm-200um-280mm'
-    """
-    table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
-    settings = settings or ExperimentSettings()
-    trials, warnings = trials_of_rows(table, settings, needed)
-    return PlannedTrials(trials, settings, None, warnings)
-
-
-def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
-    """Read the conditions in use of a folder or sheet, filmed or not: the first row of each, or `every_row`."""
-    file = path / SHEET if path.is_dir() else path
-    if not file.is_file():
-        close = closest_entry(file)
-        remedy = f"did you mean {close}?" if close else f"give a folder with {SHEET}, or a sheet"
-        raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
-    table, header = read_sheet(file)
-    settings = read_experiment_settings(file.parent / "experiment.yaml")
-    given = {*table.columns, *(name for name in SHARED if getattr(settings, name) is not None)}
-    if absent := [name for name in REQUIRED_FOR_PREDICTION if name not in given]:
-        remedy = "give a trial sheet, one row a trial, with these columns"
-        header.append(Problem("missing", f"has no column {', '.join(absent)}", file=file.name, remedy=remedy))
-    if absent or not table.rows:
-        raise ExperimentError(header)
-    trials, warnings = trials_of_rows(table, settings, REQUIRED_FOR_PREDICTION, header, file.name)
-    first = {trial.condition: trial for trial in reversed(trials)}
-    shown = tuple(trial for trial in trials if every_row or trial is first[trial.condition])
-    return PlannedTrials(shown, settings, file.parent, warnings)
-
-
-def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
-    """Return a table of rows that stand in no file: their lines are 0."""
-    columns = tuple(dict.fromkeys(name for row in rows for name in row))
-    return Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
-
-
-def trials_of_rows(
-    table: Table,
-    settings: ExperimentSettings,
-    needed: Sequence[str],
-    header: Sequence[Problem] = (),
-    file: str = "",
-    *,
-    measured: bool = False,
-) -> tuple[tuple[Trial, ...], tuple[Problem, ...]]:
-    """Check the rows in use, and make named trials of them without their recordings, unless there is an error. A
-    yield pressure that is not given is NaN, and all are vines; unless they are `measured`. Problems name the sheet, or
-    without a file the options. Returns the trials and warnings.
-    """
-    rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
-    remedy = "remove `use: no` from at least one row"
-    problems = [] if rows else [Problem("no_rows", "has no trial in use", remedy=remedy)]
-    for row in rows:
-        is_body = row.travel_ratio != 2
-        row.add_blank(needed[:1] if is_body and measured else needed, "give it")
-        if is_body and not measured:
-            remedy = "predictions are for everting vines (travel_ratio 2)"
-            row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
-        row.check_wall()
-        row.check_pressures()
-        problems += [problem for problem in row.problems if measured or problem.column not in _RECORDING_COLUMNS]
-    if not file:
-        problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]
-    problems = [*header, *(replace(problem, file=file) for problem in problems)]
-    if any(problem.severity == "error" for problem in problems):
-        raise ExperimentError(problems)
-    for row in rows if not measured else ():
-        row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
-        if "yield_pressure_kPa" not in row.values:
-            row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
-    return with_names([make_trial(row, Path(), settings) for row in rows]), tuple(problems)

@@ -26,9 +26,14 @@ from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue, own_effects
-from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.folder import (
+    REQUIRED_FOR_PREDICTION,
+    Experiment,
+    planned_rows,
+    read_experiment,
+    table_of_texts,
+)
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
-from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, table_of_texts, trials_of_rows
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
@@ -233,8 +238,8 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = {str(name): part for name, part in frame.groupby("trial", sort=False)}
     table, _ = in_sheet_units(table_of_texts([_cells(name, part) for name, part in parts.items()]), "the frame")
-    trials, _ = trials_of_rows(table, ExperimentSettings(), REQUIRED_FOR_PREDICTION, file="the frame", measured=True)
-    return [(trial, _track(trial, parts[trial.name], position)) for trial in trials]
+    made = planned_rows(table, ExperimentSettings(), REQUIRED_FOR_PREDICTION, file=Path("the frame"), measured=True)
+    return [(trial, _track(trial, parts[trial.name], position)) for trial in made.trials]
 
 
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:

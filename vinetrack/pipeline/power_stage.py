@@ -32,10 +32,10 @@ from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS
-from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.folder import Experiment, planned_sheet, read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
-from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, PlannedTrials, expected_systematic_m, planned_sheet
+from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
@@ -130,7 +130,7 @@ def _measured_campaign(
     return *fitted_tests(fitted, candidates), inputs, limits
 
 
-def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
+def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
@@ -164,7 +164,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
     return *planned_tests(model, trials, rates, spreads, noise, settings.candidates), inputs, settings.limits
 
 
-def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
+def _planned_systematic(request: PowerRequest, planned: Experiment) -> tuple[float, str]:
     """Return the systematic error of positions of planned trials, m, and where it comes from."""
     if math.isfinite(request.systematic_mm):
         return request.systematic_mm / 1e3, "stated"

@@ -20,9 +20,9 @@ from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, catalogue
+from vinetrack.experiment.folder import REQUIRED_FOR_PREDICTION, Experiment, planned_sheet, planned_trial
 from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import ExperimentSettings
-from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import check_figure, write_figure
 from vinetrack.inference.fit_data import FitError
@@ -85,7 +85,7 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
 class PredictionBasis:
     """Planned trials, stated values, a fit if there is one; `heading` stands over everything predicted from them."""
 
-    planned: PlannedTrials
+    planned: Experiment
     stated: StatedValues
     fit: FitNumbers | None
     heading: tuple[str, ...]
@@ -127,9 +127,9 @@ def read_basis(
     return PredictionBasis(planned, stated, fit, heading)
 
 
-def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
+def effects_of_plan(planned: Experiment) -> Mapping[str, Effect]:
     """Return the user's own effects of the experiment to which a sheet belongs."""
-    return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
+    return effects_of(planned.folder) if planned.settings.effects else {}
 
 
 def _effects_of_fit(fit: FitNumbers) -> Mapping[str, Effect]:
