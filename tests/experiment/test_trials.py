@@ -74,13 +74,13 @@ def test_every_column_says_whether_it_defines_a_condition() -> None:
 def test_trials_that_differ_in_a_setting_are_two_conditions():
     for name, column in COLUMNS.items():
         if name not in OF_A_REPLICATE:
-            value = OTHER_VALUES[name] if name in OTHER_VALUES else column.to_si(7.0)
+            value = OTHER_VALUES[name] if name in OTHER_VALUES else column.scale.to_si(7.0)
             assert len(conditions(column.field, value)) == 2, name
 
 
 def test_trials_that_differ_in_how_they_were_recorded_are_replicates():
     numbers = [column for name, column in COLUMNS.items() if name in OF_A_REPLICATE and column.kind == "number"]
-    assert {len(conditions(column.field, column.to_si(7.0))) for column in numbers} == {1}
+    assert {len(conditions(column.field, column.scale.to_si(7.0))) for column in numbers} == {1}
 
 
 def test_the_name_of_a_condition_shows_what_differs():

@@ -95,8 +95,15 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     """
     folder = Path(folder)
     problems: list[Problem] = []
-    settings = _read_settings(folder, problems)
-    table = _read_sheet(folder, problems)
+    settings, table = None, None
+    try:
+        settings = _read_settings(folder, problems)
+    except ExperimentError as error:
+        problems += error.problems
+    try:
+        table = _read_sheet(folder, problems)
+    except ExperimentError as error:
+        problems += error.problems
     rows = [read_row(table, i, settings or ExperimentSettings()) for i in range(len(table.rows))] if table else []
     absent: set[str] = set()
     in_use = [row for row in rows if row.in_use]
@@ -134,13 +141,9 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     )
 
 
-def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings | None:
-    """Read the settings and check their paths and values; None if they cannot be read."""
-    try:
-        settings = read_experiment_settings(folder / SETTINGS, problems)
-    except ExperimentError as error:
-        problems += error.problems
-        return None
+def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:
+    """Read the settings and check their values."""
+    settings = read_experiment_settings(folder / SETTINGS, problems)
     for name in SHARED:
         value = getattr(settings, name)
         if said := COLUMNS[name].unusual(value):
@@ -148,26 +151,20 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     return settings
 
 
-def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table | None:
-    """Read the sheet as a table and check its columns; None if it cannot be read."""
+def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
+    """Read the sheet as a table and check its columns."""
     remedy = (
         f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
         "creates both from a folder of recordings"
     )
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
-        problems.append(Problem("no_folder", message, file=str(folder), remedy=remedy))
-        return None
+        raise ExperimentError([Problem("no_folder", message, file=str(folder), remedy=remedy)])
     if not os.path.lexists(folder / SHEET):
         if close := closest_entry(folder / SHEET):
             remedy = f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
-        problems.append(Problem("missing", "is missing", file=SHEET, remedy=remedy))
-        return None
-    try:
-        table, found = read_sheet(folder / SHEET)
-    except ExperimentError as error:
-        problems += error.problems
-        return None
+        raise ExperimentError([Problem("missing", "is missing", file=SHEET, remedy=remedy)])
+    table, found = read_sheet(folder / SHEET)
     problems += found
     if "trial" not in table.columns:
         problems.append(_absent_column("trial"))
@@ -412,9 +409,8 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
     rows = [(trial.vine, rank, trial.pressure_Pa) for trial, rank in zip(trials, ranks, strict=True)]
     frame = DataFrame(rows, columns=["vine", "order", "pressure"]).dropna()
     frame = frame[frame.groupby("vine")["pressure"].transform("nunique") > 1]
-    by_vine = frame.groupby("vine")
-    count = by_vine["order"].transform("size")
-    within = by_vine.rank().sub((count + 1) / 2, axis=0).div(count, axis=0)
+    shares = frame.groupby("vine").rank(pct=True)
+    within = shares - shares.groupby(frame["vine"]).transform("mean")
     return float(within["order"].corr(within["pressure"], min_periods=8))
 
 

@@ -79,10 +79,6 @@ class Column:
         """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`."""
         return f"{'an' if self.quantity[0] in 'aeiou' else 'a'} {self.quantity} of {value:.3g} {self.unit}".rstrip()
 
-    def to_si(self, value: float) -> float:
-        """Convert a value of this column to SI."""
-        return self.scale.to_si(value)
-
     def of_trial(self, trial: Trial) -> float:
         """Return a trial's value of this column."""
         return self.scale.from_si(float(getattr(trial, self.field)))
@@ -111,11 +107,11 @@ class Column:
             error.allowed = self.allowed
             raise
 
-    def read_limit(self, value: Any) -> float:
-        """Read one number of `limits`, checked like a cell of the column."""
+    def read_key(self, value: Any) -> Any:
+        """Read a value of a settings file like a cell of the column."""
         if isinstance(value, bool | list | tuple | dict):
-            raise InputError("holds something that is not a number", "write numbers only", code="not_a_number")
-        return float(str(self.read(str(value).strip())))
+            raise InputError("is not a single value", "write one, as in the sheet", code="not_a_value")
+        return self.read(str(value).strip())
 
     def _checked(self, value: float) -> float:
         """Return the value unchanged if its column allows it."""
@@ -189,7 +185,7 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
         raise InputError("is not a range", "write low:high, such as 7:40", code="not_a_range")
-    low, high = (column.read_limit(part) for part in parts)
+    low, high = map(column.read_key, parts)
     if low > high:
         raise InputError("ends below its start", "write the lower value first", code="reversed")
     return low, high

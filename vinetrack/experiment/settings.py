@@ -176,7 +176,7 @@ class Limits(_columns(chain(*LIMITED.values()))):  # type: ignore[misc]
         limits = value if isinstance(value, list | tuple) else [value]
         if not limits:
             raise InputError("is empty", "name at least one value, or remove the key", code="empty")
-        return tuple(sorted({column.read_limit(limit) for limit in limits}))
+        return tuple(sorted(set(map(column.read_key, limits))))
 
 
 class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
@@ -229,9 +229,7 @@ class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
         column = COLUMNS[info.field_name]
         if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
             return value
-        if isinstance(value, bool | list | dict):
-            raise InputError("is not a single value", "write one, as in the sheet", code="not_a_value")
-        return column.read(str(value).strip())
+        return column.read_key(value)
 
     @field_validator("model", "candidates", "effects")
     @classmethod

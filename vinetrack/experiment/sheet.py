@@ -219,7 +219,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         column = COLUMNS[name]
         if column.kind == "path":
             value = safe_join(folder, value)
-        fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
+        fields[column.field] = column.scale.to_si(float(value)) if column.kind in ("number", "choice") else value
     return Trial(
         **fields,
         pressure_unit=row.pressure_unit,

@@ -299,7 +299,7 @@ def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]
         low, high = read_range(COLUMNS[column], text if ":" in text else (text, text))
     except InputError as error:
         raise refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
-    return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
+    return COLUMNS[column].scale.to_si(low), COLUMNS[column].scale.to_si(high)
 
 
 def design_vine(

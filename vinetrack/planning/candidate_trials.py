@@ -98,7 +98,7 @@ def _of(trial: Trial, column: str) -> float:
 def _stated(limits: Limits, column: str) -> list[float] | None:
     """Values of a column that the user allows, SI; None for any."""
     values = getattr(limits, column)
-    return None if values is None else [COLUMNS[column].to_si(value) for value in values]
+    return None if values is None else [COLUMNS[column].scale.to_si(value) for value in values]
 
 
 def _is_among(value: float, values: Iterable[float]) -> bool:

@@ -229,16 +229,13 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
     marked = [(name, marks) for name, marks in masses if marks]
     if not marked:
         raise InputError("holds no point mass with marks", "mark the leading edge as a point mass in Tracker")
-    best = max(range(len(marked)), key=lambda i: len(marked[i][1]))
-    if wanted:
-        named = [i for i, (name, _) in enumerate(marked) if name.casefold() == wanted.strip().casefold()]
-        if len(named) != 1:
-            names = ", ".join(repr(name) for name, _ in marked)
-            many = "several point masses" if named else "no point mass"
-            raise InputError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
-        best = named[0]
-    name, marks = marked[best]
-    return name, marks, [other for i, (other, _) in enumerate(marked) if i != best]
+    named = [mass for mass in marked if not wanted or mass[0].casefold() == wanted.strip().casefold()]
+    if wanted and len(named) != 1:
+        names = ", ".join(repr(name) for name, _ in marked)
+        many = "several point masses" if named else "no point mass"
+        raise InputError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
+    best = max(named, key=lambda mass: len(mass[1]))
+    return *best, [name for name, marks in marked if marks is not best[1]]
 
 
 def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
