@@ -33,16 +33,16 @@ SIDE_POINTS = (8, 5, 3)  # Points used on either side, fewer where release or th
 # Points on either side that must show at least this part of the jump too, where they are conclusive (chosen)
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
 
-_Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # Frame numbers and positions before and after
-
 
 class _Jump(NamedTuple):
-    """Jump of position between two sides of a smooth motion, its standard error and the step of one frame, m."""
+    """Jump of position between two sides of a smooth motion, its standard error and the step of one frame, m;
+    `by_outlier`: a single outlier explains the points about as well.
+    """
 
     size: float
     sigma: float
     step: float
-    sides: _Sides
+    by_outlier: bool
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
-    size, sigma, step, sides = jump
+    size, sigma, step, by_outlier = jump
     missing = round(size / step)
     long_step = y[i + 1] - y[i]
     if missing < 1 or long_step <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
@@ -184,7 +184,7 @@ def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
     if long_step <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
         return None
-    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or _outlier_explains(sides, noise_m):
+    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or by_outlier:
         return None
     if _wide_jump(frame, y, i, noise_m) < LEAST_SHARE * missing * step:
         return None
@@ -239,7 +239,8 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
         weights = np.linalg.pinv(basis)
         fit = weights @ both
-        misfit_m = math.sqrt(float(np.sum((both - basis @ fit) ** 2)) / (t.size - 4))
+        with_jump = float(np.sum((both - basis @ fit) ** 2))
+        misfit_m = math.sqrt(with_jump / (t.size - 4))
         step = float(fit[1])
         # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
         if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
@@ -247,27 +248,14 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         lag = np.abs(np.subtract.outer(t, t))
         correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
         sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
-        return _Jump(float(fit[3]), sigma, step, sides)
+        # Errors with heavy tails put a point one step ahead or behind now and then; after a jump all later ones are
+        # displaced. A single outlier, which is one parameter too, must leave three times the sum of squares.
+        smooth = basis[:, :3] @ np.linalg.pinv(basis[:, :3])
+        off = both - smooth @ both
+        with_outlier = float(np.sum(off**2) - np.max(off**2 / (1 - np.diagonal(smooth))))
+        by_outlier = with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
+        return _Jump(float(fit[3]), sigma, step, by_outlier)
     return None
-
-
-def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
-    """Whether a single outlier explains these points about as well as a jump between the sides does. Both add one
-    parameter to a plain parabola, so that their residuals are comparable. Errors with heavy tails put a point one step
-    ahead or behind now and then; after a jump all later points are displaced.
-    """
-    (t_left, y_left), (t_right, y_right) = sides
-    t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
-    t = t - (t_left[-1] + t_right[0]) / 2
-    smooth = np.column_stack([np.ones(t.size), t, t**2])
-
-    def squares(basis: Floats, y: Floats) -> float:
-        return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
-
-    with_jump = squares(np.column_stack([smooth, t > 0]), y)
-    with_outlier = min(squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
-    # A single outlier must leave this many times the sum of squares that a jump leaves.
-    return with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
 
 
 def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
