@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,13 +191,11 @@ class Track:
         return replace(self, flag=flag, notes=(*self.notes, *notes))
 
 
-def plain_track(
-    time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
-) -> Track:
-    """Make a track of positions alone, without errors unless given. Shapes of all arrays (n_frames,)."""
+def plain_track(time_s: Floats, lead_position_m: Floats, **known: Any) -> Track:
+    """Make a track of positions, and of other fields as far as they are `known`. Shapes of all arrays (n_frames,)."""
     unknown = np.full(len(time_s), np.nan)
     no_flag = np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}")
-    return Track(time_s, lead_position_m, unknown if sigma_m is None else sigma_m, no_flag, unknown.copy(), pressure_Pa)
+    return replace(Track(time_s, lead_position_m, unknown, no_flag, unknown.copy()), **known)
 
 
 @dataclass(frozen=True)

@@ -131,8 +131,6 @@ UNITS = dict(
     )
 )
 
-NO_UNIT = Unit("", "")  # That of text, and of numbers that have none
-
 # Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
 DISPLAY_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "kg": ("g", 1e3), "1": ("", 1.0)}
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders

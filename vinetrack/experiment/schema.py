@@ -22,7 +22,7 @@ from typing import Any
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number, safe_join
-from vinetrack.core.units import NO_UNIT, UNITS, Unit, convert, split_unit
+from vinetrack.core.units import UNITS, Unit, convert, split_unit
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
@@ -145,7 +145,7 @@ def _read_columns() -> dict[str, Column]:
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
     for row in rows:
-        row |= {"scale": UNITS.get(row["unit_key"], NO_UNIT), "slips": tuple(row["slips"].split())}
+        row |= {"scale": UNITS.get(row["unit_key"], Unit("", "")), "slips": tuple(row["slips"].split())}
         row |= {"shared": row["shared"] == "yes", "above_low": row["low"].startswith(">")}
         row |= {"low": float(row["low"].lstrip(">") or -math.inf), "high": float(row["high"] or math.inf)}
         row["usual_from"] = float(row["usual_from"] or -math.inf)

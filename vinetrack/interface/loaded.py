@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.core.records import Kinematics, Track, Trial, plain_track
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import html_table, plot
 from vinetrack.diagnosis.ladder import Comparison
@@ -262,12 +262,11 @@ def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
     sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1
-    track = Track(
-        time_s=part["time_s"].to_numpy(dtype=float),
-        lead_position_m=part[position].to_numpy(dtype=float),
+    track = plain_track(
+        part["time_s"].to_numpy(dtype=float),
+        part[position].to_numpy(dtype=float),
         lead_position_sigma_m=sigma_m,
         flag=flag,
-        edge_px=unknown,
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
         lead_position_systematic_m=systematic_m,
     )

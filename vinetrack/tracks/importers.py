@@ -10,10 +10,10 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,28 +58,17 @@ def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
         raise InputError(f"{where} is above 1000 kPa{hint}")
 
 
-def new_track(
-    time_s: Floats,
-    lead_position_m: Floats,
-    *,
-    sigma_m: Floats | None = None,
-    edge_px: Floats | None = None,
-    pressure_Pa: Floats | None = None,
-    notes: Iterable[str] = (),
-) -> Track:
-    """Make a track with blank flags, after the checks that all kinds of file share. Shapes: time_s, lead_position_m,
-    sigma_m, edge_px, pressure_Pa (n,).
-    """
-    known = np.isfinite(lead_position_m)
-    if (count := int(np.sum(known))) < FEWEST_POINTS:
+def new_track(time_s: Floats, lead_position_m: Floats, notes: Sequence[str], **known: Any) -> Track:
+    """Make a track of positions and other fields, after the checks that all kinds of file share. Shapes (n,)."""
+    placed_m = lead_position_m[np.isfinite(lead_position_m)]
+    if (count := placed_m.size) < FEWEST_POINTS:
         raise InputError(f"has {count} point{'s' * (count != 1)}", f"at least {FEWEST_POINTS} are needed")
-    if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
+    if max(np.max(np.abs(time_s)), np.max(np.abs(placed_m))) > LARGEST_NUMBER:
         raise InputError("holds a time or position too large to be one", "correct it")
     check_times(time_s)
-    first, last = lead_position_m[known][[0, -1]]
-    backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
-    track = plain_track(time_s, lead_position_m, sigma_m=sigma_m, pressure_Pa=pressure_Pa)
-    return replace(track, edge_px=track.edge_px if edge_px is None else edge_px, notes=(*notes, *backwards))
+    if placed_m[-1] < placed_m[0]:
+        notes = [*notes, "Position decreases from first to last point; it should grow along the axis."]
+    return plain_track(time_s, lead_position_m, notes=tuple(notes), **known)
 
 
 # ------------------------------------------------------------------------------
@@ -216,7 +205,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     if missing:
         notes.append(f"{missing} frames between the first and the last point have none.")
     time_s = start_s + (frames - start_frame) * frame_s
-    return new_track(time_s, position_m, edge_px=edge_px, notes=[*notes, note])
+    return new_track(time_s, position_m, [*notes, note], edge_px=edge_px)
 
 
 def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
@@ -330,7 +319,7 @@ def read_export(table: Table) -> Track:
         notes.append(f"{missing} rows have no position.")
     if not columns["t"][1] and not any(unit for _, unit in places):
         notes.append("The export names no units; seconds and metres are assumed.")
-    return new_track(time_s, position_m, notes=[*notes, note] if note else notes)
+    return new_track(time_s, position_m, [*notes, note] if note else notes)
 
 
 def _factor(unit: str, si: str) -> float:
@@ -478,7 +467,7 @@ def _read_positions(table: Table) -> Track:
         pressure_Pa = 1000 * np.interp(time_s, time_s[known], pressure_kPa[known])
         if not known.all():
             notes.append(f"Pressure is interpolated at {int(np.sum(~known))} points where its cell is blank.")
-    return new_track(time_s, position_m, sigma_m=sigma_m, pressure_Pa=pressure_Pa, notes=notes)
+    return new_track(time_s, position_m, notes, lead_position_sigma_m=sigma_m, pressure_Pa=pressure_Pa)
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
