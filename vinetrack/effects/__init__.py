@@ -16,9 +16,7 @@ from vinetrack.effects._catalogue import (
     listing,
     load_effect,
     own_effects,
-    remedy,
     remember,
-    told_apart,
 )
 
 __all__ = [
@@ -37,9 +35,7 @@ __all__ = [
     "listing",
     "load_effect",
     "own_effects",
-    "remedy",
     "remember",
-    "told_apart",
 ]
 
 

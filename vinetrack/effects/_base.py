@@ -246,6 +246,20 @@ class Effect:
         lines = [line.strip() for line in self.text.splitlines() if line.startswith("    ")]
         return "; ".join(line for line in lines if line)
 
+    @property
+    def remedy(self) -> str:
+        """How to reduce or measure it, as its file says in one line, or blank."""
+        return self._paragraph("Reduce it", "It cannot be reduced", "Measure it")
+
+    @property
+    def told_apart(self) -> str:
+        """Which effects it is easily taken for, and what tells them apart, as its file says, or blank."""
+        return self._paragraph("Easily taken for")
+
+    def _paragraph(self, *begins: str) -> str:
+        found = (paragraph for paragraph in self.text.split("\n\n") if paragraph.startswith(begins))
+        return " ".join(next(found, "").split()).replace("`", "")
+
     @cached_property
     def zero(self) -> tuple[float, ...]:
         """Values of the parameters at which the effect vanishes, in their order."""

@@ -229,21 +229,6 @@ def _parameter_row(effect: Effect, p: Parameter) -> tuple[str, ...]:
     )
 
 
-def remedy(effect: Effect) -> str:
-    """Return how to reduce or measure an effect, as stated in its file, in one line; blank where it is not stated."""
-    return _paragraph(effect, ("Reduce it", "It cannot be reduced", "Measure it"))
-
-
-def told_apart(effect: Effect) -> str:
-    """Return which effects it is easily taken for and how to distinguish them, as stated in its file; blank if not."""
-    return _paragraph(effect, ("Easily taken for",))
-
-
-def _paragraph(effect: Effect, begins: tuple[str, ...]) -> str:
-    found = (paragraph for paragraph in effect.text.split("\n\n") if paragraph.startswith(begins))
-    return " ".join(next(found, "").split()).replace("`", "")
-
-
 # ------------------------------------------------------------------------------
 # A user's own effects: read, and checked before a model uses them.
 

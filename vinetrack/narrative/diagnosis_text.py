@@ -19,7 +19,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.effects import Effect, remedy, told_apart
+from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
@@ -217,7 +217,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 
 def measurement_text(effects: Sequence[Effect]) -> str:
     """Return what to measure in order to exclude one of the hypotheses, as the files of their effects state."""
-    told = [(effect.name, " ".join(filter(None, (told_apart(effect), remedy(effect))))) for effect in effects]
+    told = [(effect.name, " ".join(filter(None, (effect.told_apart, effect.remedy)))) for effect in effects]
     return " ".join(f"{name}: {words[0].lower()}{words[1:]}" for name, words in told if words)
 
 

@@ -29,7 +29,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
-from vinetrack.effects import catalogue, remedy
+from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.inference.robust_covariance import FILM_ERROR
@@ -304,10 +304,8 @@ def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _remedies(names: Sequence[str]) -> str:
     """How each of these is measured, reduced or corrected."""
-    known = catalogue()
-    told = [
-        remedy(known[name]) if name in known else BETWEEN[name].remedy for name in names if name in {**known, **BETWEEN}
-    ]
+    known: dict[str, Any] = {**BETWEEN, **catalogue()}
+    told = [known[name].remedy for name in names if name in known]
     return " ".join(f"{words.rstrip('.')}." for words in told if words)
 
 
