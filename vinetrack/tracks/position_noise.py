@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, product
 
 import numpy as np
 
@@ -36,13 +36,10 @@ FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
 
 @dataclass(frozen=True)
 class Smoothing:
-    """A filter: polynomials of this degree (0 is a moving average) through a window of so many frames. Every
-    `decimation`-th smoothed frame carries the information of all.
-    """
+    """A filter: polynomials of this degree (0 is a moving average) through a window of so many frames."""
 
     window: int
     degree: int
-    decimation: int
 
     def __str__(self) -> str:
         kind = "by a moving average" if self.degree == 0 else f"by polynomials of degree {self.degree}"
@@ -58,16 +55,16 @@ class Smoothing:
 
     @property
     def weights(self) -> Floats:
-        """Filter weights of the frames in the window, shape (window,)."""
-        return _filter_weights(self.window, self.degree)
+        """Weight of each frame of the window in the value in its middle of a polynomial through them, shape (window,):
+        that of Savitzky and Golay. SciPy has them too, but takes half a second to load.
+        """
+        places = np.linspace(-1, 1, self.window)
+        return np.asarray(np.linalg.pinv(np.vander(places, self.degree + 1))[-1])
 
-
-def _filter_weights(window: int, degree: int) -> Floats:
-    """Weight of each frame of a window in the value in its middle of a polynomial through them. They are those of
-    Savitzky and Golay (Anal. Chem. 36, 1627, 1964). SciPy has them too, but takes half a second to load.
-    """
-    places = np.linspace(-1, 1, window)
-    return np.asarray(np.linalg.pinv(np.vander(places, degree + 1))[-1])
+    @property
+    def decimation(self) -> int:
+        """One smoothed frame in so many carries the information of all: an average of N keeps 1/N of the variance."""
+        return max(round(1 / float(self.weights @ self.weights)), 2)
 
 
 def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
@@ -84,18 +81,12 @@ def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0
         shapes = [(1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * f) + rho**2) for f, _ in spectra]
         ranked.append((_whittle(spectra, shapes), None))
     ranked = [max(ranked, key=lambda pair: pair[0])]
-    # Filters are compared by their windows, in frames.
-    for window in (3, 5, 7, 9, 11, 13, 15, 17, 19, 21):
-        # Degrees of the polynomials; 0 is the moving average.
-        for degree in (0, 2):
-            if degree >= window - 1:
-                continue
-            weights = _filter_weights(window, degree)
-            # Noise averaged over N frames keeps 1/N of its variance.
-            smoothing = Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
+    for window, degree in product(range(3, 22, 2), (0, 2)):
+        if degree < window - 1:
+            smoothing = Smoothing(window, degree)
             # The squared response of the filter; 1e-5: part of its power that smoothed noise keeps in a hole.
             phases = [2 * math.pi * np.outer(f, np.arange(window) - window // 2) for f, _ in spectra]
-            shapes = [np.maximum((np.cos(phase) @ weights) ** 2, 1e-5) for phase in phases]
+            shapes = [np.maximum((np.cos(phase) @ smoothing.weights) ** 2, 1e-5) for phase in phases]
             ranked.append((_whittle(spectra, shapes), smoothing))
     ranked.sort(key=lambda pair: -pair[0])
     # 30.0: gain of ln L over noise without holes, and over every other filter, that is sure (chosen)
