@@ -789,7 +789,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"Measure before making more trials: {joined(faults)} {'are errors' if len(faults) > 1 else 'is an error'} of"
         f" measurement. {measurement}"
     ),
-    "no_feasible_trial": lambda measurement: f"No trial within the limits can be made and simulated. {measurement}",
     "trials_to_make": advice_text,
     "no_trials_separate": partial(advice_text, worth_it=False),
     "diagnosis_page": diagnosis_page,
