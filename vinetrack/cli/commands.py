@@ -39,7 +39,7 @@ def _setup(folder: Path, page: bool, port: int | None, browser: bool, say: Say) 
 def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import track_file
+    from vinetrack.pipeline.report_stage import track_file
 
     with waiting(f"tracking {recording.name}"), compilation_told(say):
         return track_file(recording, **options)
@@ -154,7 +154,7 @@ def _compare(results: Path) -> Answer:
 def _overlay(results: Path, trial: str, experiment: Path | None, seconds: float) -> Answer:
     """Write a slowed-down clip of one trial with tracked and modelled edges."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import overlay_one
+    from vinetrack.pipeline.report_stage import overlay_one
 
     with waiting(f"drawing over {trial}"):
         path = overlay_one(results, trial, experiment, seconds)
