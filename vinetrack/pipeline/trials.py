@@ -155,17 +155,13 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     track, kinematics = empty_table(TRACK_COLUMNS), empty_table(KINEMATICS_COLUMNS)
     if summary is not None:
         measured = summary.track
-        columns = (
-            np.arange(len(measured.time_s)),
-            measured.time_s,
-            measured.edge_px,
-            measured.lead_position_m,
-            measured.lead_position_sigma_m,
-            measured.flag,
-            measured.edge_px if measured.tracked_px is None else measured.tracked_px,
-            np.nan if measured.lead_position_systematic_m is None else measured.lead_position_systematic_m,
-        )
-        track = pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
+        unmoved, systematic_m = measured.tracked_px, measured.lead_position_systematic_m
+        columns = vars(measured) | {
+            "frame": np.arange(len(measured.time_s)),
+            "tracked_edge_px": measured.edge_px if unmoved is None else unmoved,
+            "lead_position_systematic_m": np.nan if systematic_m is None else systematic_m,
+        }
+        track = pd.DataFrame({column: columns[column] for column in TRACK_COLUMNS})
         kinematics = pd.DataFrame({column: getattr(summary.kinematics, column) for column in KINEMATICS_COLUMNS})
         point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
         windows = []
