@@ -116,15 +116,8 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
     return rows
 
 
-POWER_COLUMNS = (
-    "effect",
-    "",
-    "50 % power",
-    "90 % power",
-    "largest plausible",
-    "power there",
-    "mistaken for (at 90 %)",
-)  # Headings of `power_rows`
+# Headings of `power_rows`
+POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", "power there", "mistaken for (at 90 %)")
 
 
 def power_lines(power: Power) -> list[str]:
@@ -235,13 +228,6 @@ def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(told)
 
 
-def separation_text(if_true: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the significance with which the trials would separate each pair of hypotheses, at least."""
-    return ", ".join(
-        f"{pair.replace(' | ', ' from ')} by {min(by_truth.values()):.2g} σ" for pair, by_truth in if_true.items()
-    )
-
-
 def advice_text(
     trials: Sequence[Mapping[str, Any]],
     if_true: Mapping[str, Mapping[str, float]],
@@ -252,7 +238,8 @@ def advice_text(
     worth_it: bool = True,
 ) -> str:
     """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
-    promise, advice = separation_text(if_true), str(measurement)
+    advice = str(measurement)
+    promise = ", ".join(f"{pair.replace(' | ', ' from ')} by {min(by.values()):.2g} σ" for pair, by in if_true.items())
     if not worth_it:
         return (
             f"No trials within `limits` separate the tied hypotheses by {least_sigma:g} σ; the best would separate"
@@ -339,22 +326,17 @@ def table_lines(diagnosis: Diagnosis, notes: bool = True) -> list[str]:
 def _ranking(step: Round) -> list[str]:
     from vinetrack.core.terminal import table
 
-    rows = []
     testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
-    is_tied = sum(candidate.in_answer_set for candidate in testable) > 1
-    # 8: candidates of a round that the terminal shows (chosen)
-    for candidate in testable[:8]:
-        weight = candidate.posterior_weight if is_tied and candidate.in_answer_set else math.nan
-        share = f", posterior weight {100 * weight:.0f} %" if weight < 0.995 else ""
-        rows.append(
-            (
-                ("* " if candidate.in_answer_set else "  ") + candidate.effect,
-                f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
-                f"{candidate.sigma:.1f}",
-                estimates_text(candidate),
-                str(candidate.reason) or candidate.status + share,
-            )
+    rows = [
+        (
+            ("* " if candidate.in_answer_set else "  ") + candidate.effect,
+            f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
+            f"{candidate.sigma:.1f}",
+            estimates_text(candidate),
+            str(candidate.reason) or candidate.status,
         )
+        for candidate in testable[:8]  # as many as the terminal shows (chosen)
+    ]
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
     untestable = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
@@ -418,7 +400,7 @@ _LAWS = {
     "speed": ("a force in proportion to the speed ẋ", "{size} at the highest"),
     "speed_squared": ("a force in proportion to ẋ²", "{size} at the highest speed"),
     "position_squared": ("a force in proportion to x²", "{size} at the end"),
-    "beyond_a_place": ("a force that rises in proportion to the growth beyond {scale_mm} mm", "{size} at the end"),
+    "beyond_a_place": ("a force that rises in proportion to the growth beyond {milli} mm", "{size} at the end"),
     "speed_cubed": ("a force in proportion to ẋ³", "{size} at the highest speed"),
     "beyond_a_speed": ("a force in proportion to the excess of ẋ over {scale} m/s", "{size} at the highest speed"),
     "squared_beyond_a_speed": (
@@ -432,13 +414,13 @@ _LAWS = {
         "a force that falls with speed",
         "{size} at the lowest speed, by a factor of e every {scale} m/s of ẋ",
     ),
-    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {scale_ms} ms"),
+    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {milli} ms"),
     "fading_along": (
         "a force that decays along the growth",
-        "{size} at the start, by a factor of e every {scale_mm} mm",
+        "{size} at the start, by a factor of e every {milli} mm",
     ),
     "patch": ("a force that acts between {low} and {high} mm of growth, {size}", ""),
-    "periodic": ("a force that repeats every {scale_mm} mm of growth, {size}", ""),
+    "periodic": ("a force that repeats every {milli} mm of growth, {size}", ""),
 }
 
 
@@ -456,8 +438,7 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
         size=size,
         low=f"{1e3 * max(law.low, 0.0):.0f}",
         high=f"{1e3 * law.high:.0f}",
-        scale_mm=number(1e3 * law.scale),
-        scale_ms=number(1e3 * law.scale),
+        milli=number(1e3 * law.scale),
         scale=f"{law.scale:.2g}",
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text

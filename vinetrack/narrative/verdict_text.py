@@ -217,7 +217,7 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     """Sizes of what was added, else of the members of the answer set."""
     if diagnosis.effects:
         added = [p for p in diagnosis.parameters if p.key.split(".")[0] in diagnosis.effects]
-        wider = [f"{interval_text(p)}{_confounded_interval(diagnosis, p)}" for p in added]
+        wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in added]
         return ", ".join(map(split_estimate, added)), "; ".join([*wider, *_shared_remedies(added)])
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
     return "; ".join(f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]), ""
@@ -229,7 +229,7 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
     with_them = [f"with {listed_names(diagnosis.effects)} in the model"] if law and diagnosis.effects else []
-    notes = [*(f"n {interval_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
+    notes = [*(f"n 95 %: {bounds_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
 
@@ -379,17 +379,14 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
-def interval_text(entry: Number) -> str:
-    """Return the 95 % interval of a fitted number, said to be one, in its display unit."""
-    return f"95 %: {bounds_text(entry, display_unit(entry.unit)[0])}"
-
-
-def bounds_text(entry: Number, unit: str = "") -> str:
+def bounds_text(entry: Number, with_unit: bool = False) -> str:
     """Return the ends of the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
-    factor = display_unit(entry.unit)[1]
+    unit, factor = display_unit(entry.unit)
     if not (is_finite(entry.low) and is_finite(entry.high)):
         return "open"
-    text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
+    text = (
+        f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)}{f' {unit}' if with_unit else ''}".strip()
+    )
     ends = entry.ends_at
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
