@@ -278,10 +278,8 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
 
 # Quantities that the force may depend on: label, and factor from SI
 _FORCE_AXES = {
-    "tail_position_m": ("tail position x (mm)", 1e3),
     "lead_position_m": ("growth y (mm)", 1e3),
     "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
-    "lead_velocity_m_s": ("leading-edge speed ẏ (m/s)", 1.0),
     "time_s": ("time since release (ms)", 1e3),
     "pressure_Pa": ("pressure (kPa)", 1e-3),
 }
@@ -460,8 +458,4 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
     import pandas as pd
 
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
-    rows = [
-        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, estimates_text(c), c.reason)
-        for c in ranked.ranking
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame([vars(c) | {"size": estimates_text(c)} for c in ranked.ranking], columns=columns)

@@ -200,11 +200,6 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
     return table.sort_values(["place", "pressure_kPa"], kind="stable", ignore_index=True)
 
 
-def describe_trial(trial: Trial) -> str:
-    """Return a title for a trial: name, vine, pressure and payload."""
-    return f"{trial.name} · {' · '.join(features(trial))}"
-
-
 def features(trial: Trial) -> list[str]:
     """Return sizes, pressure and payload of a trial in words."""
     sizes = f"{1e3 * trial.diameter_m:g} mm"

@@ -326,7 +326,7 @@ def design_vine(
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
-    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",") if part.strip()]
+    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",")]
     room = Room(
         films_m=tuple(dict.fromkeys(films_m)),
         diameter_m=read_si_range("diameter_mm", diameter),
@@ -336,9 +336,6 @@ def design_vine(
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
-    max_films = 12  # Largest number of films (chosen)
-    if not 0 < len(room.films_m) <= max_films:
-        raise refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
     thickest_m = max(room.films_m)
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"

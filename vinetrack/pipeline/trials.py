@@ -25,7 +25,7 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_trial_motion
 from vinetrack.figures.overlay import draw_strip
-from vinetrack.figures.registry import describe_trial
+from vinetrack.figures.registry import features
 from vinetrack.figures.style import blank
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
 from vinetrack.kinematics.summary import TrialError, TrialResult, condition_table, summarise_trial
@@ -200,7 +200,7 @@ def _draw(
 
 def _described(name: str, trial: Trial | None) -> tuple[str, float]:
     """Title of the figure of a trial, and its travel ratio; `trial` is None if its row of the sheet is faulty."""
-    return (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
+    return (name, 2.0) if trial is None else (" · ".join([name, *features(trial)]), trial.travel_ratio)
 
 
 def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
