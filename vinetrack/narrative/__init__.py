@@ -1,7 +1,7 @@
 """Results in words: the only room with prose. A result or a remark (a code with its numbers) becomes sentences here.
 
-`sentences.csv` holds the sentence of each remark, with its facts in braces; those that take more than a template are
-functions in `diagnosis_text.REMARKS`.
+`sentences.csv` holds the sentence of each remark, with its facts in braces; what takes more is a function in
+`diagnosis_text.REMARKS`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import csv
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 
@@ -32,7 +33,23 @@ def sentence(code: str, facts: Mapping[str, Any]) -> str:
     """Return the sentence of a remark."""
     from vinetrack.narrative.diagnosis_text import REMARKS
 
-    return REMARKS[code](**facts) if code in REMARKS else templates()[code].format_map(facts)
+    return REMARKS[code](**facts) if code in REMARKS else _Words().vformat(templates()[code], (), facts)
+
+
+class _Words(Formatter):
+    """Formats of a sentence: those of Python; a name of `FORMS`; `mm` or `%` before a format multiply; `?yes|no` is one
+    of two texts, the first for what is true or not empty.
+    """
+
+    def format_field(self, value: Any, form: str) -> str:
+        from vinetrack.narrative.diagnosis_text import FORMS
+
+        if form.startswith("?"):
+            return form[1:].split("|")[0 if value else 1]
+        for unit, factor in (("mm", 1e3), ("%", 100.0)):
+            if form.startswith(unit):
+                return format(factor * value, form.removeprefix(unit))
+        return FORMS[form](value) if form in FORMS else format(value, form)
 
 
 @cache

@@ -512,13 +512,6 @@ def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: flo
     )
 
 
-def like_no_law_text(law: str, explained: float, variable: str, alone: float) -> str:
-    """Return that no simple law describes the missing force, and the variable that a force of it alone explains it."""
-    text = f"What is missing looks like none of the simple laws: the best, {law}, explains {explained:.0%} of it."
-    depends = f" It depends on {_variables_text(variable)}: a force of that alone explains {alone:.0%}."
-    return text + depends if alone else text
-
-
 def _variables_text(name: str) -> str:
     """Return a choice of variables in words."""
     words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
@@ -650,14 +643,6 @@ def speed_band_text(share: Band) -> str:
     return f"{number(share.low)} to {number(share.high)} m/s"
 
 
-def _at_place(y_over_L: float) -> str:
-    return "" if y_over_L == 1 else f" at y/L = {y_over_L:g}"
-
-
-def _of_draws(share: float) -> str:
-    return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
-
-
 def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
     """Names of numbers and sizes of their changes, in display units."""
     return [(name, f"{size * by:.2g} {u}".rstrip()) for name, size, unit in changes for u, by in [display_unit(unit)]]
@@ -673,33 +658,33 @@ def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -
     )
 
 
-def _recordings(trials: Sequence[str]) -> str:
-    return f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
+def _of_draws(share: float) -> str:
+    return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
 
+
+# Facts in words, by the names that `sentences.csv` gives them in place of a format
+FORMS: dict[str, Callable[[Any], str]] = {
+    "and": joined,
+    "list": ", ".join,
+    "rivals": "; ".join,
+    "sum": " + ".join,
+    "code": lambda names: f"`{'` and `'.join(names)}`",
+    "number": number,
+    "word": lambda count: ("two", "three", "four", "five")[count - 2],
+    "sizes": lambda changes: ", ".join(f"{name} by ± {size}" for name, size in _with_sizes(changes)),
+    "remedy": lambda source: SHARED_REMEDIES[source],
+    "condition": lambda condition: _condition_text(**condition),
+    "variables": _variables_text,
+    "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
+    "draws": _of_draws,
+    "recordings": lambda trials: (
+        f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
+    ),
+}
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
     "film_matters": film_matters_text,
-    "spread_taken": lambda name, spread: (
-        f"the between-trial standard deviation of {name} is taken as {100 * spread:.2g} %"
-    ),
-    "not_constrained": lambda title, wider: (
-        f"{title}: the trajectories do not constrain it beyond the value in the sheet"
-        + ("; trials disagree by more than their noise, so its error is larger than in the sheet" if wider else "")
-    ),
-    "not_separable": lambda names: f"these data do not determine separate values of {', '.join(names)}",
-    "misfit": lambda ratio, may_vary: (
-        f"the residuals are {ratio:.3g} times the noise of the tracks"
-        f"{f', although {joined(may_vary)} may vary from trial to trial' if may_vary else ''}: an effect is missing, or"
-        " the tracks have slow errors larger than their noise"
-    ),
-    "mostly_shared": lambda names, source: (
-        f"most of the error of {', '.join(names)} comes from what all trials share: {SHARED_REMEDIES[source]}"
-    ),
-    "trials_disagree": lambda differences: (
-        "trials disagree by more than their noise, in "
-        f"{', '.join(f'{name} by ± {size}' for name, size in _with_sizes(differences))}: they get nearly equal weights"
-    ),
     "pressures_corrected": lambda count, largest_kPa: (
         f"recorded pressures of {f'{count} trials' if count > 1 else 'one trial'} are corrected by up to"
         f" {largest_kPa:.2g} kPa, within the errors that the noise of the gauge leaves, to agree with the motion"
@@ -708,29 +693,9 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
         " body that moves as a whole has none"
     ),
-    "columns_partly_blank": lambda columns: (
-        f"it needs `{'` and `'.join(columns)}`, which the sheet leaves blank for some trials"
-    ),
-    "implausible_size": lambda symbol, value, unit, low, high: (
-        f"it would need {symbol} = {f'{value:.3g} {unit}'.strip()}, and {low:.3g} to {high:.3g} is plausible"
-    ),
-    "several_missing": lambda count: (
-        f"{('two', 'three', 'four', 'five')[count - 2]} effects are missing: none alone removes the misfit"
-    ),
-    "not_tried": lambda names: f"Not tried, because the sheet does not state what they need: {joined(names)}.",
-    "left_out_error_does_not_fall": lambda name, without_m, with_m: (
-        f"Against this verdict: The error on left-out conditions does not fall with {name}: {1e3 * without_m:.2f} mm"
-        f" without it, {1e3 * with_m:.2f} mm with it. The data support {name} by the shape of the motion alone."
-    ),
-    "still_drifts": lambda model, drift: f"Against this verdict: With {' + '.join(model)}: {drift}",
     "left_out_error_without": lambda left_out, count, reason: (
         f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
         f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
-    ),
-    "medians_and_bands": lambda model, samples: f"{' + '.join(model)}; medians and 90 % bands of {samples} draws",
-    "fastest_by": lambda quantity, y_over_L, share, burst_MPa, kPa: (
-        f"fastest by {quantity}{_at_place(y_over_L)}; hoop stress up to {share:.0%} of {burst_MPa:g} MPa, supply up to"
-        f" {kPa:g} kPa"
     ),
     "sweeps": lambda trial, swept_m3, in_full: (
         f"{trial_text(trial) if in_full else _size_text(trial)}: it sweeps {volume_text(swept_m3)}"
@@ -738,13 +703,6 @@ REMARKS: dict[str, Callable[..., str]] = {
     "supplied_chambers": lambda ms, volumes: (
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
-    ),
-    "speeds_at_medians": lambda y_over_L, m_s: (
-        f"speed: final speed at the medians{_at_place(y_over_L)}; {number(m_s)} m/s at constant pressure"
-    ),
-    "goes_slack": lambda share: (
-        f"the tail goes slack on the way {_of_draws(share)}: tail speeds are then those of the film at the tip, and a"
-        " payload falls freely, at a speed that is not predicted"
     ),
     "tail_compressed": lambda share, median_N, low_N, has_payload: (
         f"the model predicts compression in the tail {_of_draws(share)} (least tension {median_N:.2g} N"
@@ -755,16 +713,6 @@ REMARKS: dict[str, Callable[..., str]] = {
     ),
     "odd_trials": odd_in_words,
     "odd_trials_decide": odd_deciding_in_words,
-    "frames_missing": lambda trials: (
-        f"Frames are missing from {_recordings(trials)}: the edge moves much farther from one frame to the next than in"
-        " the frames around them, so the camera or the disk dropped frames. The times were corrected; record again"
-        " where it matters."
-    ),
-    "frames_perhaps_missing": lambda trials: (
-        f"Frames may be missing from {_recordings(trials)}: the edge moves farther from one frame to the next than in"
-        " the frames around them, and the later times were shifted accordingly. Points farther away are too few or too"
-        " noisy to confirm it: look at the recording."
-    ),
     "deciding_measurements": measurement_text,
     "measure_first": lambda faults, measurement: (
         f"Measure before making more trials: {joined(faults)} {'are errors' if len(faults) > 1 else 'is an error'} of"
@@ -774,17 +722,8 @@ REMARKS: dict[str, Callable[..., str]] = {
     "no_trials_separate": partial(advice_text, worth_it=False),
     "diagnosis_page": diagnosis_page,
     "law": law_text,
-    "fails_nowhere": lambda z, condition: (
-        "In no condition does the mean of the replicates deviate from the model by more than their scatter explains"
-        f" (at most {z:.1f} σ, at {_condition_text(**condition)})."
-    ),
     "fails_most": fails_most_text,
     "drifts": drift_text,
-    "like_no_law": like_no_law_text,
-    "like_a_law": lambda law, explained, others: (
-        f"What is missing looks like {law}; that explains {explained:.0%} of what any force could."
-        + (f" These data fit nearly as well with: {'; '.join(others)}." if others else "")
-    ),
     "learned_force": learned_force_text,
     "learned_file": learned_file_text,
     "law_file": lambda law, formula, origin: _file_text(
