@@ -643,19 +643,10 @@ def speed_band_text(share: Band) -> str:
     return f"{number(share.low)} to {number(share.high)} m/s"
 
 
-def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
-    """Names of numbers and sizes of their changes, in display units."""
-    return [(name, f"{size * by:.2g} {u}".rstrip()) for name, size, unit in changes for u, by in [display_unit(unit)]]
-
-
-def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -> str:
-    """Return the message that an error of the film's mass matters as much as the errors stated."""
-    listed = ", ".join(f"{name} by {size}" for name, size in _with_sizes(changes)[:4])
-    more = f", and {len(changes) - 4} more" if len(changes) > 4 else ""
-    return (
-        f"these errors assume the stated mass of the film; an error of {100 * error:g} % in each vine would change"
-        f" {listed}{more}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3"
-    )
+def _sizes(changes: Sequence[tuple[str, float, str]], by: str) -> list[str]:
+    """Names of numbers with the sizes of their changes, in display units."""
+    sized = [(name, f"{size * times:.2g} {u}") for name, size, unit in changes for u, times in [display_unit(unit)]]
+    return [f"{name} {by} {size}".rstrip() for name, size in sized]
 
 
 def _of_draws(share: float) -> str:
@@ -671,7 +662,10 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "code": lambda names: f"`{'` and `'.join(names)}`",
     "number": number,
     "word": lambda count: ("two", "three", "four", "five")[count - 2],
-    "sizes": lambda changes: ", ".join(f"{name} by ± {size}" for name, size in _with_sizes(changes)),
+    "scatter": lambda changes: ", ".join(_sizes(changes, "by ±")),
+    "changes": lambda changes: (
+        ", ".join(_sizes(changes[:4], "by")) + (f", and {len(changes) - 4} more" if len(changes) > 4 else "")
+    ),
     "remedy": lambda source: SHARED_REMEDIES[source],
     "condition": lambda condition: _condition_text(**condition),
     "variables": _variables_text,
@@ -684,7 +678,6 @@ FORMS: dict[str, Callable[[Any], str]] = {
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
-    "film_matters": film_matters_text,
     "pressures_corrected": lambda count, largest_kPa: (
         f"recorded pressures of {f'{count} trials' if count > 1 else 'one trial'} are corrected by up to"
         f" {largest_kPa:.2g} kPa, within the errors that the noise of the gauge leaves, to agree with the motion"

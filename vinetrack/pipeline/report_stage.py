@@ -134,9 +134,7 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
 def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
     """Write the clip of one trial; return its path."""
     track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
-    shown, line = frames_to_show(track), analysed.get("axis")
-    if line is None:
-        raise ResultsError(f"{results.analysed(trial.name)} does not state the axis: run snakemake again")
+    shown, line = frames_to_show(track), analysed["axis"]
     mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
     shake_px = shake_along(line, len(track))
     edges, release_s = edges_to_draw(trial.name, results, track)
@@ -161,11 +159,10 @@ def _write_clip(
 
     def drawn() -> Iterator[NDArray[np.uint8]]:
         low = high = 0.0
-        for frame, picture in enumerate(islice(iterate_frames(recording), shown.stop)):
-            if frame in shown[::stride]:
-                if high == low:
-                    low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
-                yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]))
+        for frame, picture in islice(enumerate(iterate_frames(recording)), shown.start, shown.stop, stride):
+            if high == low:
+                low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
+            yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]))
 
     rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
     play_fps, stride = playback_rate(len(shown), settings.seconds)
