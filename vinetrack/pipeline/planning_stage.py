@@ -28,7 +28,7 @@ from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.schema import COLUMNS, CellError, option, read_range
 from vinetrack.experiment.settings import Limits
@@ -134,7 +134,7 @@ def read_basis(
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
     if tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
-    user_effects = effects_of_plan(planned) if fit is None else _effects_of_fit(fit)
+    user_effects = _own_effects(planned, fit)
     read = [read_sizes(text, user_effects) for text in effects]
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
@@ -142,24 +142,12 @@ def read_basis(
     return PredictionBasis(planned, stated, fit, heading)
 
 
-def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
-    """Return the user's own effects of the experiment to which a sheet belongs."""
-    return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
-
-
-def _effects_of_fit(fit: FitNumbers) -> Mapping[str, Effect]:
-    """Read the user's own effects of the experiment that was fitted, if the model contains any."""
-    own_names = [name for name in fit.fit.names if name not in catalogue()]
-    if not own_names:
-        return {}
-    experiment = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
-    user_effects = effects_of(experiment) if experiment.is_dir() else {}
-    if not set(own_names) <= set(user_effects):
-        raise ResultsError(
-            f"{fit.source} was fitted with {', '.join(own_names)}, an effect of its experiment, which is no longer "
-            f"in {experiment}: put the folder back, or fit again"
-        )
-    return user_effects
+def _own_effects(planned: PlannedTrials, fit: FitNumbers | None = None) -> Mapping[str, Effect]:
+    """Return the user's own effects of the experiment that was fitted, else of that to which a sheet belongs."""
+    folder = planned.folder
+    if fit is not None:
+        folder = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
+    return {} if folder is None else effects_of(folder)
 
 
 @contextmanager
@@ -509,7 +497,7 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
         pairs = pairs_of(experiment)[0]
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
-    model = make_model(names, effects_of(experiment.folder) if settings.effects else {})
+    model = make_model(names, effects_of(experiment.folder))
     return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
 
 
@@ -534,7 +522,7 @@ def _measured_campaign(
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     settings = planned.settings
-    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
+    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=_own_effects(planned))
     of_vines = {trial.vine: trial for trial in reversed(planned.trials)}
     by_vine = {trial.vine: predictive_inputs(of_vines[trial.vine], stated) for trial in planned.trials}
     first = next(iter(by_vine.values()))

@@ -137,8 +137,7 @@ def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_w
         yield from map(function, items)
         return
     # Forked on Linux, where workers are ready at once and share what is imported, and spawned elsewhere.
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     with ProcessPoolExecutor(min(n_workers, len(items)), mp_context=context, initializer=_end_with_parent) as pool:
         futures = [pool.submit(function, item) for item in items]
         try:
