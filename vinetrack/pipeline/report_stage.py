@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import INTERNAL_ERROR, UserError
+from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, with_flag
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.core.terminal import table
@@ -314,10 +314,7 @@ def track_file(
         recording = inspect_recording(path)
         rate = capture_fps if recording.capture_fps is None else recording.capture_fps
         if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
-            raise UserError(
-                f"{path.name}: --capture-fps is {capture_fps:g}, but the file states a capture rate of {rate:g}; "
-                "leave --capture-fps out"
-            )
+            raise UserError(str(remark("other_rate_in_file", file=path.name, given=capture_fps, stated=rate)))
         trial = Trial(
             name=path.stem,
             video=recording.path,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import INTERNAL_ERROR
+from vinetrack.core.problems import INTERNAL_ERROR, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_csv, write_json
 from vinetrack.dynamics.model import Model, make_model
@@ -258,12 +258,8 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
     }
     failed: dict[str, dict[str, Any]] = {}
     for names, agreed in askew_trials(slopes_deg, experiment.trials):
-        reason = (
-            f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
-            "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
-        )
         for name in names:
-            row = _bare_row(name, "failed", reason, experiment.trial(name))
+            row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
             failed[name] = {"row": row, "windows": [], "point": None}
     return failed
 

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
+from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems, remark
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.core.units import number
@@ -355,10 +355,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     if smoothing := detect_smoothing(tracks, rounding_m):
         notes.append(smoothing.note)
     if rounding_m > 0:
-        notes.append(
-            f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"
-            " export them with all measured digits."
-        )
+        notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))
 
 
