@@ -36,7 +36,9 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code():
     makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= templates().keys() | REMARKS.keys()
-    assert [code for code in (*templates(), *REMARKS) if not re.search(rf"""["']{code}["']""", source)] == []
+    assert [code for code in REMARKS if not re.search(rf"""["']{code}["']""", source)] == []
+    source += "".join(path.read_text(encoding="utf-8") for path in (PACKAGE / "narrative").glob("*_text.py"))
+    assert [code for code in templates() if not re.search(rf"""["']{code}["']""", source)] == []
 
 
 def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:

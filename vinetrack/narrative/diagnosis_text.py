@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.narrative import sentence
 from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
@@ -72,10 +72,7 @@ def _at_largest(power: EffectPower) -> float:
 
 def false_alarm_sentence(power: Power) -> str:
     """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
-    return (
-        f"If nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
-        "campaigns, provided that noise and scatter are as fitted."
-    )
+    return sentence("false_alarms", {"rate": power.false_alarm_rate})
 
 
 def detectable_count(power: Power) -> str:
@@ -183,10 +180,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         lines += [f"  {line}" for line in table(rows, head, ("", "", "", "g", "", ""), align="><>><>")]
     if not plan.is_reached:
         if plan.unlimited < plan.target:
-            lines.append(
-                f"No number of trials within `limits` suffices: with unlimited replicates of all {plan.n_conditions} "
-                f"conditions considered, the power would be {percent(plan.unlimited)}."
-            )
+            lines.append(sentence("no_number_suffices", {"count": plan.n_conditions, "power": plan.unlimited}))
         else:
             lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.unlimited)} power.")
     changes = {"with a new vine"} if any(trial["new_vine"] for trial in plan.trials) else set()
@@ -228,25 +222,10 @@ def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(told)
 
 
-def advice_text(
-    trials: Sequence[Mapping[str, Any]],
-    if_true: Mapping[str, Mapping[str, float]],
-    unresolved: Sequence[str],
-    measurement: Remark,
-    least_sigma: float,
-    *,
-    worth_it: bool = True,
-) -> str:
+def advice_text(unresolved: Sequence[str], measurement: Remark, **facts: Any) -> str:
     """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
-    advice = str(measurement)
-    promise = ", ".join(f"{pair.replace(' | ', ' from ')} by {min(by.values()):.2g} σ" for pair, by in if_true.items())
-    if not worth_it:
-        return (
-            f"No trials within `limits` separate the tied hypotheses by {least_sigma:g} σ; the best would separate"
-            f" {promise}. {advice}".rstrip()
-        )
-    text = f"Make {trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
-    if any(trial["new_vine"] for trial in trials):
+    text, advice = sentence("trials_separate", facts), str(measurement)
+    if any(trial["new_vine"] for trial in facts["trials"]):
         text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
     if unresolved:
         pairs = joined([pair.replace(" | ", " from ") for pair in unresolved])
@@ -483,33 +462,19 @@ def drift_condition(column: str) -> tuple[str, str, float]:
 
 def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: float = math.nan) -> str:
     """Return how a parameter drifts: a row of the table, whether it rises steadily, the error of the sheet."""
-    against, z, start, stop = (row[name] for name in ("against", "z", "from_level", "to_level"))
+    against, start, stop = (row[name] for name in ("against", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
-    if against == "sheet":
-        return (
-            f"{who} is pulled from the {start / 1e3:.2f} ± {stated_sigma_Pa / 1e3:.2f} kPa of the sheet to"
-            f" {stop / 1e3:.2f} kPa ({z:.1f} σ)."
-        )
     change, error = 100 * row["change"], 100 * row["change_sigma"]
     digits = max(decimals(error) - 1, 0)
-    amount = f"{change:.{digits}f} ± {error:.{digits}f} %"
+    facts = {**row, "who": who, "amount": f"{change:.{digits}f} ± {error:.{digits}f} %"}
+    if against == "sheet":
+        return sentence("drifts_from_sheet", facts | {"sigma_Pa": stated_sigma_Pa})
     if against == "growth":
-        larger, smaller = ("second", "first") if stop > start else ("first", "second")
-        return (
-            f"{who} would have to be {amount} larger in the {larger} half of the growth than in the {smaller}"
-            f" ({z:.1f} σ), though it should not change along the growth."
-        )
-    name, shown, times = drift_condition(against)
-    if steady:
-        return (
-            f"{who} rises by {amount} from {start * times:.3g} {shown} to {stop * times:.3g} {shown} of {name}"
-            f" ({z:.1f} σ), though it should not depend on the {name}."
-        )
-    low, high = sorted((start * times, stop * times))
-    return (
-        f"{who} is not the same at every {name} ({row['z_constancy']:.1f} σ), without rising or falling steadily from"
-        f" {low:.3g} {shown} to {high:.3g} {shown}."
-    )
+        return sentence("drifts_along_growth", facts | {"later": stop > start})
+    name, unit, times = drift_condition(against)
+    low, high = (start, stop) if steady else sorted((start, stop))
+    facts |= {"name": name, "low": f"{low * times:.3g} {unit}", "high": f"{high * times:.3g} {unit}"}
+    return sentence("rises_with" if steady else "is_not_constant", facts)
 
 
 def _variables_text(name: str) -> str:
@@ -520,40 +485,16 @@ def _variables_text(name: str) -> str:
 
 
 def learned_force_text(
-    name: str,
-    weights: Mapping[str, float],
-    alternatives: Sequence[str],
-    begins: str,
-    range_N: tuple[float, float],
-    sigma_N: float,
-    explained: float,
-    is_repeated: bool,
-    has_pressures: bool,
+    name: str, weights: Mapping[str, float], alternatives: Sequence[str], range_N: tuple[float, float], **facts: Any
 ) -> str:
     """Return the variables of the learned force and how certain they are, its range and error, from where it is
     measured, what limits the result, and which trials would help.
     """
     shares = {one: f" (posterior weight {weights[one]:.0%})" for one in weights}
     choices = joined([f"{_variables_text(one)}{shares.get(one, '')}" for one in (name, *alternatives)], "or by")
-    low, high = range_N
-    text = (
-        f"Learned as a smooth function inside the fit, the missing force is described by {choices}. As a function of"
-        f" {_variables_text(name)} it ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard"
-        f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit."
-    ).replace("-", "−")
-    if begins:
-        text += f" Where growth begins it is {begins}: B, n and P_y could account for a part that is constant."
-    else:
-        text += " These trials do not decide how much of it belongs to B, n and P_y."
-    if not is_repeated:
-        text += " No condition was repeated: how sure this is rests on the scatter that the fit assumes."
-    if not has_pressures:
-        text += " All trials had one pressure, so they do not show whether the force depends on it."
-    if alternatives:
-        text += (
-            " Trials that reach the same growth at another speed or time, by another pressure or payload, would tell."
-        )
-    return text
+    low, high = (f"{end_N:.2f}".replace("-", "−") for end_N in range_N)
+    facts |= {"name": name, "choices": choices, "alternatives": alternatives, "low": low, "high": high}
+    return sentence("force_is_learned", facts)
 
 
 def proposal_lines(proposal: Proposal) -> list[str]:
@@ -572,12 +513,9 @@ def proposal_lines(proposal: Proposal) -> list[str]:
     else:
         lines.append(f"{proposal.reason}{'' if proposal.table else '; nothing is proposed'}.")
     if (table := proposal.table) is not None:
-        lines.append(
-            f"No formula in the list reproduces the learned force. As a table ({table.effect.name}) it reduces χ² per"
-            f" point from {proposal.before.chi2_per_dof:.1f} to {table.ratio.fit.chi2_per_dof:.1f}; the error on"
-            f" left-out conditions, with the table itself learned from all trials, is {1e3 * table.rms_left_out_m:.2f}"
-            " mm."
-        )
+        before, after = proposal.before.chi2_per_dof, table.ratio.fit.chi2_per_dof
+        facts = {"name": table.effect.name, "before": before, "after": after, "rms_m": table.rms_left_out_m}
+        lines.append(sentence("no_formula_but_a_table", facts))
     return lines
 
 
@@ -597,11 +535,7 @@ def learned_file_text(learned: LearnedForce, origin: str) -> str:
         f"{_variables_text(name)} from {low * shown[name][2]:.3g} to {high * shown[name][2]:.3g} {shown[name][1]}"
         for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
     ]
-    validity = (
-        f"It is valid for {joined(ranges)}, the range that trials visited; outside, it keeps its value at the edge,"
-        " which has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
-        " reproduces these trials but explains nothing: look at its figure, and find the formula."
-    )
+    validity = sentence("valid_where_learned", {"ranges": ranges})
     symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))
     formula = f"tail force a T({symbols}), T the sum of {counts} cubic splines on even steps"
     title = f"Learned force: a table over {_variables_text(domain.name)}, no law."
@@ -671,6 +605,11 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "variables": _variables_text,
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
     "draws": _of_draws,
+    "percent": percent,
+    "trials": trials_in_words,
+    "separated": lambda if_true: ", ".join(
+        f"{pair.replace(' | ', ' from ')} by {min(by_truth.values()):.2g} σ" for pair, by_truth in if_true.items()
+    ),
     "recordings": lambda trials: (
         f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
     ),
@@ -712,7 +651,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         f" measurement. {measurement}"
     ),
     "trials_to_make": advice_text,
-    "no_trials_separate": partial(advice_text, worth_it=False),
     "diagnosis_page": diagnosis_page,
     "law": law_text,
     "fails_most": fails_most_text,
