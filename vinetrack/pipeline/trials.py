@@ -221,8 +221,6 @@ def fit_damping(job: Job) -> list[str]:
     law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
     write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
     write_json(results.damping, law)
-    for method, fit in law.items():
-        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
     failed = int((table["status"] == "failed").sum())
     return [f"{len(table)} trials, {failed} failed.", damping_headline(law)]
 
@@ -242,8 +240,6 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     write_csv(results.points, mark_left_out(points))
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
-    for row in table.itertuples():
-        log.info("%s: %s %s", row.trial, row.status, row.reason)
     return table
 
 
