@@ -285,7 +285,7 @@ _FORCE_AXES = {
 }
 
 
-@figure("learned_force", "where", "The missing force, learned in the fit", data="learned_force", if_refuted=SHOWS_REFUTED)
+@figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force", if_refuted=SHOWS_REFUTED)
 def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     """The missing force, learned within the fit as a smooth function of the variables on which it most likely
     depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the
