@@ -437,19 +437,12 @@ def _condition_text(pressure_Pa: float, unit: str, payload_kg: float | None = No
     return f"{pressure_text(pressure_Pa, unit)}{load}{f' ({vine})' if vine else ''}"
 
 
-def fails_most_text(
-    condition: Mapping[str, Any], rms_m: float, floor_m: float, worst_residual_m: float, worst_sigma_m: float, z: float
-) -> str:
+def fails_most_text(worst_residual_m: float, worst_sigma_m: float, **facts: Any) -> str:
     """Return where a model fails most, and by how much."""
-    scatter = "without replicates"
-    if math.isfinite(floor_m):
-        scatter = f"where replicates scatter by {1e3 * floor_m:.2g} mm"
     digits = decimals(1e3 * worst_sigma_m)
     off = f"{1e3 * abs(worst_residual_m):.{digits}f} ± {1e3 * worst_sigma_m:.{digits}f} mm"
-    return (
-        f"The model fails most at {_condition_text(**condition)}: root mean square {1e3 * rms_m:.2g} mm {scatter};"
-        f" there the vine is {off} {'ahead of' if worst_residual_m > 0 else 'behind'} the model ({z:.1f} σ in all)."
-    )
+    facts |= {"off": off, "is_ahead": worst_residual_m > 0, "is_repeated": math.isfinite(facts["floor_m"])}
+    return sentence("fails_most_at", facts)
 
 
 def drift_condition(column: str) -> tuple[str, str, float]:
