@@ -34,7 +34,7 @@ pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
 """
 WRITTEN = (
     "report.html", "provenance.json", "trials.csv", "damping.json", "fit.json", "diagnosis.json", "ladder.csv",
-    "figures/overview.svg",
+    "figures/model_comparison.svg",
 )  # fmt: skip
 MIB = 2**20
 

@@ -116,7 +116,7 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
 
     figures = results / "figures"
     drawn = {path.stem for path in figures.glob("*.svg") if not path.stem.startswith(("trial_", "strip_"))}
-    assert {"damping_law", "scaling", "overview", "model_comparison", "model_residuals"} <= drawn
+    assert {"damping_law", "scaling", "model_comparison", "model_residuals"} <= drawn
     for name in (*drawn, "trial_d12_0", "trial_torn"):
         assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert "<svg" in (figures / f"{name}.svg").read_text(encoding="utf-8")

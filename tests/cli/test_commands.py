@@ -33,7 +33,7 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_summary import summary_of
 from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, write_experiment
 from vinetrack.pipeline import model_stage
-from vinetrack.pipeline.predict_stage import read_basis, read_si_range
+from vinetrack.pipeline.planning_stage import read_basis, read_si_range
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.planning.prediction import CURVE_COLUMNS
 

@@ -72,16 +72,6 @@ def test_a_drifting_parameter_is_drawn_against_the_condition():
     assert after.get_ydata() == pytest.approx([1, 1, 1])
 
 
-def test_the_missing_force_is_drawn_against_each_variable():
-    point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05}
-    rows = [point | {"against": name, "condition": c} for name in NOTHING for c in ("", "a", "b")]
-    fig = figures.draw_missing_force(pd.DataFrame(rows))
-    labels = ["growth y (mm)", "tail speed ẋ (m/s)", "time since release (ms)", "pressure (kPa)"]
-    assert [ax.get_xlabel() for ax in fig.axes] == labels
-    assert fig.axes[0].containers[0].lines[0].get_xdata() == pytest.approx([100.0])
-    assert_nothing_is_cut_off(fig)
-
-
 def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
     cells = [
         {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}

@@ -85,29 +85,6 @@ def test_the_power_law_and_the_straight_line_are_drawn_as_fitted():
     assert "slope 1.80 (1.2 to 2.4)" in power.get_label()
 
 
-def campaign(n_conditions: int, replicates: int) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
-    time_s = np.linspace(0, 0.1, 40)
-    rows, curves = [], {}
-    for i in range(n_conditions):
-        motion = {"time_s": time_s, "lead_position_m": (1 + i) * time_s, "lead_velocity_m_s": float(1 + i)}
-        for k in range(replicates):
-            curves[f"c{i}_{k}"] = pd.DataFrame(motion)
-            row = {"trial": f"c{i}_{k}", "vine": "v", "condition": f"c{i}", "condition_label": f"12 mm, {i} kPa"}
-            rows.append({**row, "pressure_kPa": i, "status": "ok", "steady_from_s": 0.05, "steady_to_s": 0.08})
-    return pd.DataFrame(rows), curves
-
-
-@pytest.mark.parametrize(("n_conditions", "replicates", "n_panels"), [(1, 1, 1), (40, 2, 40), (500, 1, 60)])
-def test_all_trials_have_a_panel_for_each_condition_in_the_order_of_the_sheet(n_conditions, replicates, n_panels):
-    figure = motion_figures.draw_overview(*campaign(n_conditions, replicates))
-    panels = [ax for ax in figure.axes if ax.get_visible()]
-    assert [ax.get_title(loc="left") for ax in panels] == [f"12 mm, {i} kPa" for i in range(n_panels)]
-    assert len([line for ax in panels for line in ax.lines if line.get_linewidth() < 1]) == n_panels * replicates
-    if n_conditions == 40:
-        assert_nothing_is_cut_off(figure)
-    assert ("first 60 of 500 conditions" in figure.get_suptitle()) == (n_conditions == 500)
-
-
 def test_the_same_figure_gives_the_same_bytes():
     first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
     assert first == second
@@ -123,7 +100,6 @@ def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
 def test_without_content_there_is_no_figure():
     assert draw_damping_law(points().iloc[:0], REFUSED) is None
     assert draw_scaling({"isometric": [], "thickness": []}) is None
-    assert motion_figures.draw_overview(campaign(1, 1)[0], {}) is None
     assert motion_figures.draw_model_comparison(comparison(1)[0].iloc[:0], {}) is None
     assert motion_figures.draw_model_residuals(comparison(1)[0].iloc[:0], {}) is None
 

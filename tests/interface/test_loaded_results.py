@@ -53,7 +53,7 @@ def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded):
 
 
 def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded, tmp_path):
-    for name in ("", "overview", "model_comparison", "before_after", "candidates"):
+    for name in ("", "model_comparison", "before_after", "candidates"):
         assert isinstance(loaded.plot(name), Figure)
     assert isinstance(loaded.plot("trial_motion", trial="d24_24kPa_1"), Figure)
     with pytest.raises(ResultsError):

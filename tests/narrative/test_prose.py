@@ -13,7 +13,7 @@ import vinetrack
 from vinetrack.core.problems import remark
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
-from vinetrack.narrative import SENTENCES
+from vinetrack.narrative import templates
 from vinetrack.narrative.diagnosis_text import REMARKS, further_lines
 from vinetrack.narrative.verdict_text import verdict_sentence
 
@@ -35,8 +35,10 @@ def test_no_module_outside_the_room_of_prose_parses_it():
 def test_every_code_has_a_sentence_and_every_sentence_a_code():
     makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
-    assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= SENTENCES.keys() | REMARKS.keys()
-    assert [code for code in (*SENTENCES, *REMARKS) if not re.search(rf"""["']{code}["']""", source)] == []
+    assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= templates().keys() | REMARKS.keys()
+    assert [code for code in REMARKS if not re.search(rf"""["']{code}["']""", source)] == []
+    source += "".join(path.read_text(encoding="utf-8") for path in (PACKAGE / "narrative").glob("*_text.py"))
+    assert [code for code in templates() if not re.search(rf"""["']{code}["']""", source)] == []
 
 
 def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:

@@ -19,9 +19,9 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.registry import figures_of
 from vinetrack.laboratory import tracks
-from vinetrack.pipeline import power_stage
+from vinetrack.pipeline import planning_stage
 from vinetrack.pipeline.model_stage import fit_model
-from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
+from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 from vinetrack.pipeline.stages import STAGES, Job
 from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result, read_stored_track
 
@@ -193,7 +193,7 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypat
         asked_for.append((effect, seed))
         return SimulatedDiagnosis("leak", True) if effect and seed % 2 else SimulatedDiagnosis()
 
-    monkeypatch.setattr(power_stage, "simulated_diagnosis", answered)
+    monkeypatch.setattr(planning_stage, "simulated_diagnosis", answered)
     nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated
     assert asked_for == [("", 1), ("", 2), ("", 3), ("leak", 1), ("leak", 2), ("leak", 3)]
     assert (nothing.count, nothing.campaigns) == (0, 3)

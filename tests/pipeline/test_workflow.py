@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from test_pipeline import write_campaign
 
-from vinetrack.core.problems import ExperimentError
+from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
 
@@ -111,7 +111,7 @@ def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
     assert [name for name in plan.jobs if name.startswith("trials")] == ["trials_1", "trials_2", "trials_3"]
     parts = [part for stage, _, part in plan.jobs.values() if stage == "trials"]
     assert [name for part in parts for name in part] == names
-    assert [path for part in parts for path in plan.files("<tracks>", part)] == plan.files("<tracks>")
+    assert [path for part in parts for path in plan.files("<trials>", part)] == plan.files("<trials>")
     assert [*planned(experiment(tmp_path / "w")).jobs] == ["trials", "model", "report"]
 
 
@@ -164,7 +164,7 @@ def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     with pytest.raises(ExperimentError, match="pressure_kPa"):
         workflow.check_before_run(*wrong, print)
     (folder / "trials.csv").write_text("nothing\n")
-    with pytest.raises(workflow.RunError, match="trial"):
+    with pytest.raises(UserError, match="trial"):
         workflow.run_chain(*paths, 1, print)
     assert (paths[1] / "logs" / "run.log").is_file()
 

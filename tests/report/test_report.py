@@ -223,7 +223,7 @@ def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit():
 def test_pictures_stand_in_the_parts_they_belong_to():
     figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
     html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
-    order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
+    order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-learned_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', 'id="drift"', "figure-drift"]
     places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
     assert places == sorted(places)

@@ -39,7 +39,7 @@ def _setup(folder: Path, page: bool, port: int | None, browser: bool, say: Say) 
 def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import track_file
+    from vinetrack.pipeline.report_stage import track_file
 
     with waiting(f"tracking {recording.name}"), compilation_told(say):
         return track_file(recording, **options)
@@ -154,7 +154,7 @@ def _compare(results: Path) -> Answer:
 def _overlay(results: Path, trial: str, experiment: Path | None, seconds: float) -> Answer:
     """Write a slowed-down clip of one trial with tracked and modelled edges."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import overlay_one
+    from vinetrack.pipeline.report_stage import overlay_one
 
     with waiting(f"drawing over {trial}"):
         path = overlay_one(results, trial, experiment, seconds)
@@ -205,7 +205,7 @@ OF_A_RIG = ("film_density_kg_m3", "yield_pressure_kPa", "pressure_kPa", "payload
 )
 def _predict(sheet: Path | None, options: dict[str, Any]) -> Answer:
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
-    from vinetrack.pipeline.predict_stage import predict_conditions
+    from vinetrack.pipeline.planning_stage import predict_conditions
 
     return predict_conditions(sheet=sheet, **options)
 
@@ -217,7 +217,7 @@ def _predict(sheet: Path | None, options: dict[str, Any]) -> Answer:
 )
 def _vine(options: dict[str, Any]) -> Answer:
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
-    from vinetrack.pipeline.predict_stage import design_vine
+    from vinetrack.pipeline.planning_stage import design_vine
 
     return design_vine(**options)
 
@@ -230,7 +230,7 @@ def _vine(options: dict[str, Any]) -> Answer:
 )
 def _reservoir(options: dict[str, Any]) -> Answer:
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
-    from vinetrack.pipeline.predict_stage import design_reservoir
+    from vinetrack.pipeline.planning_stage import design_reservoir
 
     return design_reservoir(**options)
 
@@ -242,7 +242,7 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
 
     from vinetrack.core.tables import write_csv
     from vinetrack.figures.style import check_figure, write_figure
-    from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
+    from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
 
     check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))

@@ -227,7 +227,7 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
 
 
 # ------------------------------------------------------------------------------
-# Where the model fails: the misfit of every condition along its growth, and the missing force.
+# Where the model fails: the misfit of every condition along its growth, and the missing force learned inside the fit.
 
 
 @figure("where", "where", "Misfit by condition and position", data="where")
@@ -278,47 +278,14 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
 
 # Quantities that the force may depend on: label, and factor from SI
 _FORCE_AXES = {
-    "tail_position_m": ("tail position x (mm)", 1e3),
     "lead_position_m": ("growth y (mm)", 1e3),
     "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
-    "lead_velocity_m_s": ("leading-edge speed ẏ (m/s)", 1.0),
     "time_s": ("time since release (ms)", 1e3),
     "pressure_Pa": ("pressure (kPa)", 1e-3),
 }
 
 
-@figure("missing_force", "where", "The missing force", data="missing_force", if_refuted=SHOWS_REFUTED)
-def draw_missing_force(missing_force: pd.DataFrame) -> Figure | None:
-    """The force that would have to be added to the model to explain the misfit, against position, speed, time and
-    pressure: grey for single conditions, blue for their mean with one standard error. Where all conditions fall on
-    one curve, the force depends on that alone.
-    """
-    panels = [name for name in _FORCE_AXES if len(missing_force) and (missing_force["against"] == name).any()][:4]
-    if not panels:
-        return None
-    n_columns = min(len(panels), 2)
-    fig = st.new_figure(1.0 + 4.0 * n_columns, 0.5 + 2.7 * math.ceil(len(panels) / n_columns))
-    for ax, against in zip(st.panel_grid(fig, len(panels), n_columns, sharey=True), panels, strict=True):
-        words, factor = _FORCE_AXES[against]
-        points = missing_force[missing_force["against"] == against].sort_values("value")
-        single, mean = points[points["condition"] != ""], points[points["condition"] == ""]
-        for _, curve in single.groupby("condition", sort=False):
-            ax.plot(factor * curve["value"], curve["force_N"], color=st.MUTED, lw=0.9, alpha=0.8)
-        if len(mean):
-            at, sigma = factor * mean["value"], np.nan_to_num(st.column(mean, "sigma_N"))
-            ax.errorbar(at, mean["force_N"], sigma, color=st.BLUE, marker="o", ms=4, lw=1.5, elinewidth=1)
-        ax.axhline(0, color=st.INK, lw=0.8)
-        ax.set_xlabel(words)
-        if len(single):
-            st.small_title(ax, f"N = {single['condition'].nunique()} conditions", color=st.MUTED)
-    fig.supylabel("missing force (N)", fontsize=11)
-    return fig
-
-
-@figure(
-    "learned_force", "where", "The missing force, learned inside the fit", data="learned_force",
-    if_refuted=SHOWS_REFUTED,
-)  # fmt: skip
+@figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force", if_refuted=SHOWS_REFUTED)
 def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     """The missing force, learned within the fit as a smooth function of the variables on which it most likely
     depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the
@@ -412,7 +379,6 @@ class DiagnosisTables:
         self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
-        self.missing_force = found.get("missing_force.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
         self.rounds: list[tuple[str, pd.DataFrame]] = []
         for i, ranked in enumerate(rounds):
@@ -492,8 +458,4 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
     import pandas as pd
 
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
-    rows = [
-        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, estimates_text(c), c.reason)
-        for c in ranked.ranking
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame([vars(c) | {"size": estimates_text(c)} for c in ranked.ranking], columns=columns)

@@ -1,10 +1,10 @@
-"""The motion of all trials, of one trial, and of the model beside the measurement, mostly in small panels."""
+"""The motion of one trial, and of the model beside the measurement in small panels."""
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,61 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_PANELS = 60  # Chosen: in rows of eight they are 1.4 in wide, the narrowest that has room for its label
-
-
-def _small_panels(labels: Sequence[str], x_label: str, y_label: str, title: str) -> tuple[Figure, list[Axes], float]:
-    """A page of small panels, about 1.3 times as high as wide, each with its label; the panels and their font size."""
-    n = len(labels)
-    n_columns = min(math.ceil(math.sqrt(1.3 * n)), 8) if n > 3 else n
-    font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
-    panel_in = min(11.0 / n_columns, 6.0)
-    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
-    fig = st.new_figure(n_columns * panel_in, math.ceil(n / n_columns) * row_in + 0.95)
-    panels = st.panel_grid(fig, n, n_columns)
-    for ax, label in zip(panels, labels, strict=True):
-        st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
-        ax.tick_params(labelsize=font - 0.5)
-        ax.locator_params(nbins=4)
-    fig.supxlabel(x_label, fontsize=11)
-    fig.supylabel(y_label, fontsize=11)
-    fig.suptitle(textwrap.fill(title, int(n_columns * panel_in * 11)), fontsize=11, x=0.01, ha="left")
-    return fig, panels, font
-
-
-def _points_each(n_trials: int) -> int:
-    """Points of each curve: 12,000 in all keep the SVG below a megabyte."""
-    return min(max(12_000 // n_trials, 25), 150)
-
-
-@figure("overview", "damping", "All trials at a glance", data="trials.csv")
-def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
-    """Speed of the leading edge against growth, one panel per condition in the order of the sheet, each with its own
-    speed axis; replicates are superposed. Thick: the steady window of the gated rule. The fastest per cent of points
-    may lie outside a panel.
-    """
-    drawn = trials[[len(kinematics.get(name, ())) > 1 for name in trials["trial"]]]
-    if drawn.empty:
-        return None
-    conditions = list(drawn.groupby("condition", sort=False))
-    shown = conditions[:_MOST_PANELS]
-    styles, n_points = st.vine_styles(trials["vine"]), _points_each(len(drawn))
-    title = f"{len(drawn)} of {len(trials)} trials; thick: steady by the gated rule"
-    title += f"; the first {len(shown)} of {len(conditions)} conditions" if len(conditions) > len(shown) else ""
-    labels = [str(part["condition_label"].iloc[0]) for _, part in shown]
-    fig, panels, font = _small_panels(labels, "growth (mm)", "leading-edge speed (m/s)", title)
-    for ax, (_, part) in zip(panels, shown, strict=True):
-        fastest_m_s = 0.0
-        for row in st.rows(part):
-            curve, colour = st.thinned(kinematics[row.trial], n_points), styles[row.vine].colour
-            grown_mm, speed_m_s = st.column(curve, "lead_position_m", 1e3), st.column(curve, "lead_velocity_m_s")
-            grown_mm = grown_mm - grown_mm.min()
-            steady = curve["time_s"].between(row.steady_from_s, row.steady_to_s).to_numpy()
-            ax.plot(grown_mm, speed_m_s, color=colour, lw=0.8, alpha=0.5)
-            ax.plot(grown_mm[steady], speed_m_s[steady], color=colour, lw=2.2, solid_capstyle="butt")
-            fastest_m_s = max(fastest_m_s, float(np.percentile(speed_m_s, 99)))
-        ax.set(xlim=(0, None), ylim=(0, 1.15 * fastest_m_s or None))
-        st.corner_text(ax, 0.98, 0.05, f"N = {len(part)}", ha="right", fontsize=font - 1)
-    return fig
 
 
 # ------------------------------------------------------------------------------
@@ -173,8 +118,19 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     mean square of model minus measurement, and in brackets its ratio to the replicate scatter.
     """
     corner = (0.03, 0.97, "left", "top")  # which the curve of growth leaves empty
-    labels = "time since release (ms)", "growth (mm)"
-    return _model_panels(comparison, trajectories, _draw_positions, corner, *labels)
+    fig, panels = _model_panels(comparison, trajectories, corner, "time since release (ms)", "growth (mm)")
+    for ax, parts, longest, colour in panels:
+        time_ms, mean_mm, sigma_mm, model_mm = (
+            st.column(longest, name, 1e3)
+            for name in ("time_s", "replicates_mean_m", "replicates_sigma_m", "model_position_m")
+        )
+        st.band(ax, time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, colour)
+        for part in parts:
+            ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
+        ax.plot(time_ms, model_mm, color=st.INK, lw=1.5, ls=st.DASHED)
+        if "model_after_m" in longest:
+            ax.plot(time_ms, st.column(longest, "model_after_m", 1e3), color=st.INK, lw=1.5)
+    return fig
 
 
 @figure("model_residuals", "model", "Residuals of the model", data="comparison.csv", if_refuted=SHOWS_REFUTED)
@@ -184,69 +140,60 @@ def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd
     all trials of a panel share, or that grows with pressure, shows a missing effect.
     """
     corner = (0.98, 0.03, "right", "bottom")  # where residuals get extra room
-    labels = "growth (mm)", "measurement − model (mm)"
-    return _model_panels(comparison, trajectories, _draw_residuals, corner, *labels)
+    fig, panels = _model_panels(comparison, trajectories, corner, "growth (mm)", "measurement − model (mm)")
+    for ax, parts, longest, colour in panels:
+        by_growth = longest.sort_values("replicates_mean_m")
+        sigma_mm = st.column(by_growth, "replicates_sigma_m", 1e3)
+        st.band(ax, st.column(by_growth, "replicates_mean_m", 1e3), -sigma_mm, sigma_mm, colour)
+        ax.axhline(0, color=st.INK, lw=1.0, ls=st.DASHED)
+        for part in parts:
+            residual_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
+            ax.plot(1e3 * part["lead_position_m"], residual_mm, color=colour, lw=0.9)
+        low, high = ax.get_ylim()
+        ax.set_ylim(low - 0.35 * (high - low), high)  # room for the words below
+    return fig
 
 
 def _model_panels(
-    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame],
-    draw: Callable[[Axes, list[pd.DataFrame], str], None], corner: tuple[float, float, str, str], x_label: str,
-    y_label: str,
-) -> Figure | None:  # fmt: skip
+    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], corner: tuple[float, float, str, str],
+    x_label: str, y_label: str,
+) -> tuple[Figure | None, list[tuple[Axes, list[pd.DataFrame], pd.DataFrame, str]]]:  # fmt: skip
+    """A page of small panels, about 1.3 times as high as wide, with the numbers of each in a corner. Returns it, and
+    for every panel its axes, its trials from shortly before anything moves, the longest of them, and its colour.
+    """
     known = comparison[comparison["condition"].isin(list(trajectories))]
     farthest = known["rms_position_m"].fillna(0.0).sort_values(ascending=False, kind="stable").index[:_MOST_PANELS]
     shown = list(st.rows(known[known.index.isin(farthest)]))
     if not shown:
-        return None
-    n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
-    styles, (x, y, ha, va) = st.vine_styles([row.vine for row in shown]), corner
+        return None, []
+    n, n_trials = len(shown), sum(trajectories[row.condition]["trial"].nunique() for row in shown)
+    n_points = min(max(12_000 // n_trials, 25), 150)  # 12,000 in all keep the SVG below a megabyte
     title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
-    if len(known) > len(shown):
-        title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
-    fig, panels, font = _small_panels([str(row.condition_label) for row in shown], x_label, y_label, title)
-    for ax, row in zip(panels, shown, strict=True):
-        parts = _moving(trajectories[row.condition], _points_each(n_trials))
-        draw(ax, parts, styles[row.vine].colour)
+    if len(known) > n:
+        title += f"; the {n} of {len(known)} conditions with the largest error"
+    n_columns = min(math.ceil(math.sqrt(1.3 * n)), 8) if n > 3 else n
+    font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+    panel_in = min(11.0 / n_columns, 6.0)
+    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
+    fig = st.new_figure(n_columns * panel_in, math.ceil(n / n_columns) * row_in + 0.95)
+    styles, (x, y, ha, va), panels = st.vine_styles([row.vine for row in shown]), corner, []
+    for ax, row in zip(st.panel_grid(fig, n, n_columns), shown, strict=True):
+        label = str(row.condition_label)
+        st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
+        ax.tick_params(labelsize=font - 0.5)
+        ax.locator_params(nbins=4)
+        parts = []
+        for _, part in trajectories[row.condition].groupby("trial", sort=False):
+            time_s, growth_m = st.column(part, "time_s"), st.column(part, "lead_position_m")
+            begun = growth_m >= growth_m[0] + 0.01 * (np.max(growth_m) - growth_m[0])
+            first_s = min(0.0, float(np.min(time_s[begun])))
+            parts.append(st.thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
         times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
         words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
         st.corner_text(ax, x, y, words, ha=ha, va=va, fontsize=font - 1.5)
-    return fig
-
-
-def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
-    """Each trial from shortly before model or measurement moves, thinned for a small panel."""
-    parts = []
-    for _, part in table.groupby("trial", sort=False):
-        time_s, growth_m = st.column(part, "time_s"), st.column(part, "lead_position_m")
-        begun = growth_m >= growth_m[0] + 0.01 * (np.max(growth_m) - growth_m[0])
-        first_s = min(0.0, float(np.min(time_s[begun])))
-        parts.append(st.thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
-    return parts
-
-
-def _longest(parts: list[pd.DataFrame]) -> pd.DataFrame:
-    return max(parts, key=lambda part: float(part["time_s"].iloc[-1]))
-
-
-def _draw_positions(ax: Axes, parts: list[pd.DataFrame], colour: str) -> None:
-    longest = _longest(parts)
-    time_ms = st.column(longest, "time_s", 1e3)
-    mean_mm, sigma_mm = st.column(longest, "replicates_mean_m", 1e3), st.column(longest, "replicates_sigma_m", 1e3)
-    st.band(ax, time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, colour)
-    for part in parts:
-        ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
-    ax.plot(time_ms, st.column(longest, "model_position_m", 1e3), color=st.INK, lw=1.5, ls=st.DASHED)
-    if "model_after_m" in longest:
-        ax.plot(time_ms, st.column(longest, "model_after_m", 1e3), color=st.INK, lw=1.5)
-
-
-def _draw_residuals(ax: Axes, parts: list[pd.DataFrame], colour: str) -> None:
-    by_growth = _longest(parts).sort_values("replicates_mean_m")
-    sigma_mm = st.column(by_growth, "replicates_sigma_m", 1e3)
-    st.band(ax, st.column(by_growth, "replicates_mean_m", 1e3), -sigma_mm, sigma_mm, colour)
-    ax.axhline(0, color=st.INK, lw=1.0, ls=st.DASHED)
-    for part in parts:
-        residual_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
-        ax.plot(1e3 * part["lead_position_m"], residual_mm, color=colour, lw=0.9)
-    low, high = ax.get_ylim()
-    ax.set_ylim(low - 0.35 * (high - low), high)  # room for the text below
+        longest = max(parts, key=lambda part: float(part["time_s"].iloc[-1]))
+        panels.append((ax, parts, longest, styles[row.vine].colour))
+    fig.supxlabel(x_label, fontsize=11)
+    fig.supylabel(y_label, fontsize=11)
+    fig.suptitle(textwrap.fill(title, int(n_columns * panel_in * 11)), fontsize=11, x=0.01, ha="left")
+    return fig, panels

@@ -140,12 +140,6 @@ class FigureTables:
         return describe_conditions(read_result(self.results.trials), self.known)
 
     @cached_property
-    def kinematics(self) -> dict[str, pd.DataFrame]:
-        """Motion of every trial that is not left out, by name."""
-        names = self.trials.loc[self.trials["status"] != "left_out", "trial"]
-        return {name: read_result(self.results.kinematics(name)) for name in names}
-
-    @cached_property
     def comparison(self) -> pd.DataFrame:
         """`comparison.csv` with vines and labels; a refuted model says so in its name."""
         compared = label_conditions(read_result(self.results.comparison), self.trials)
@@ -204,11 +198,6 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
     table = comparison.merge(first, on="condition")
     table = table.assign(place=table["vine"].map(place))
     return table.sort_values(["place", "pressure_kPa"], kind="stable", ignore_index=True)
-
-
-def describe_trial(trial: Trial) -> str:
-    """Return a title for a trial: name, vine, pressure and payload."""
-    return f"{trial.name} · {' · '.join(features(trial))}"
 
 
 def features(trial: Trial) -> list[str]:

@@ -501,7 +501,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
         tracks, or pairs of trial and track.
     *effects : names, or `name=size` in the unit of the parameter; all by default.
     **options
-        Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
+        Options of `vinetrack.pipeline.planning_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
         `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed` for complete diagnoses
         of simulated campaigns; `reach`, the probability with which further trials shall detect `name=size`.
 
@@ -523,7 +523,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     >>> round(power["leak"].probability_at(1.0), 2)
     1.0
     """
-    from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
+    from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 
     if isinstance(source, LoadedResults | Experiment):
         source = source.folder

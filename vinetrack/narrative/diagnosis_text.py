@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.narrative import sentence
 from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
@@ -72,10 +72,7 @@ def _at_largest(power: EffectPower) -> float:
 
 def false_alarm_sentence(power: Power) -> str:
     """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
-    return (
-        f"If nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
-        "campaigns, provided that noise and scatter are as fitted."
-    )
+    return sentence("false_alarms", {"rate": power.false_alarm_rate})
 
 
 def detectable_count(power: Power) -> str:
@@ -116,15 +113,8 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
     return rows
 
 
-POWER_COLUMNS = (
-    "effect",
-    "",
-    "50 % power",
-    "90 % power",
-    "largest plausible",
-    "power there",
-    "mistaken for (at 90 %)",
-)  # Headings of `power_rows`
+# Headings of `power_rows`
+POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", "power there", "mistaken for (at 90 %)")
 
 
 def power_lines(power: Power) -> list[str]:
@@ -190,10 +180,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         lines += [f"  {line}" for line in table(rows, head, ("", "", "", "g", "", ""), align="><>><>")]
     if not plan.is_reached:
         if plan.unlimited < plan.target:
-            lines.append(
-                f"No number of trials within `limits` suffices: with unlimited replicates of all {plan.n_conditions} "
-                f"conditions considered, the power would be {percent(plan.unlimited)}."
-            )
+            lines.append(sentence("no_number_suffices", {"count": plan.n_conditions, "power": plan.unlimited}))
         else:
             lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.unlimited)} power.")
     changes = {"with a new vine"} if any(trial["new_vine"] for trial in plan.trials) else set()
@@ -235,31 +222,10 @@ def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(told)
 
 
-def separation_text(if_true: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the significance with which the trials would separate each pair of hypotheses, at least."""
-    return ", ".join(
-        f"{pair.replace(' | ', ' from ')} by {min(by_truth.values()):.2g} σ" for pair, by_truth in if_true.items()
-    )
-
-
-def advice_text(
-    trials: Sequence[Mapping[str, Any]],
-    if_true: Mapping[str, Mapping[str, float]],
-    unresolved: Sequence[str],
-    measurement: Remark,
-    least_sigma: float,
-    *,
-    worth_it: bool = True,
-) -> str:
+def advice_text(unresolved: Sequence[str], measurement: Remark, **facts: Any) -> str:
     """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
-    promise, advice = separation_text(if_true), str(measurement)
-    if not worth_it:
-        return (
-            f"No trials within `limits` separate the tied hypotheses by {least_sigma:g} σ; the best would separate"
-            f" {promise}. {advice}".rstrip()
-        )
-    text = f"Make {trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
-    if any(trial["new_vine"] for trial in trials):
+    text, advice = sentence("trials_separate", facts), str(measurement)
+    if any(trial["new_vine"] for trial in facts["trials"]):
         text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
     if unresolved:
         pairs = joined([pair.replace(" | ", " from ") for pair in unresolved])
@@ -339,22 +305,17 @@ def table_lines(diagnosis: Diagnosis, notes: bool = True) -> list[str]:
 def _ranking(step: Round) -> list[str]:
     from vinetrack.core.terminal import table
 
-    rows = []
     testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
-    is_tied = sum(candidate.in_answer_set for candidate in testable) > 1
-    # 8: candidates of a round that the terminal shows (chosen)
-    for candidate in testable[:8]:
-        weight = candidate.posterior_weight if is_tied and candidate.in_answer_set else math.nan
-        share = f", posterior weight {100 * weight:.0f} %" if weight < 0.995 else ""
-        rows.append(
-            (
-                ("* " if candidate.in_answer_set else "  ") + candidate.effect,
-                f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
-                f"{candidate.sigma:.1f}",
-                estimates_text(candidate),
-                str(candidate.reason) or candidate.status + share,
-            )
+    rows = [
+        (
+            ("* " if candidate.in_answer_set else "  ") + candidate.effect,
+            f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
+            f"{candidate.sigma:.1f}",
+            estimates_text(candidate),
+            str(candidate.reason) or candidate.status,
         )
+        for candidate in testable[:8]  # as many as the terminal shows (chosen)
+    ]
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
     untestable = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
@@ -418,7 +379,7 @@ _LAWS = {
     "speed": ("a force in proportion to the speed ẋ", "{size} at the highest"),
     "speed_squared": ("a force in proportion to ẋ²", "{size} at the highest speed"),
     "position_squared": ("a force in proportion to x²", "{size} at the end"),
-    "beyond_a_place": ("a force that rises in proportion to the growth beyond {scale_mm} mm", "{size} at the end"),
+    "beyond_a_place": ("a force that rises in proportion to the growth beyond {milli} mm", "{size} at the end"),
     "speed_cubed": ("a force in proportion to ẋ³", "{size} at the highest speed"),
     "beyond_a_speed": ("a force in proportion to the excess of ẋ over {scale} m/s", "{size} at the highest speed"),
     "squared_beyond_a_speed": (
@@ -432,13 +393,13 @@ _LAWS = {
         "a force that falls with speed",
         "{size} at the lowest speed, by a factor of e every {scale} m/s of ẋ",
     ),
-    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {scale_ms} ms"),
+    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {milli} ms"),
     "fading_along": (
         "a force that decays along the growth",
-        "{size} at the start, by a factor of e every {scale_mm} mm",
+        "{size} at the start, by a factor of e every {milli} mm",
     ),
     "patch": ("a force that acts between {low} and {high} mm of growth, {size}", ""),
-    "periodic": ("a force that repeats every {scale_mm} mm of growth, {size}", ""),
+    "periodic": ("a force that repeats every {milli} mm of growth, {size}", ""),
 }
 
 
@@ -456,8 +417,7 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
         size=size,
         low=f"{1e3 * max(law.low, 0.0):.0f}",
         high=f"{1e3 * law.high:.0f}",
-        scale_mm=number(1e3 * law.scale),
-        scale_ms=number(1e3 * law.scale),
+        milli=number(1e3 * law.scale),
         scale=f"{law.scale:.2g}",
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
@@ -477,19 +437,12 @@ def _condition_text(pressure_Pa: float, unit: str, payload_kg: float | None = No
     return f"{pressure_text(pressure_Pa, unit)}{load}{f' ({vine})' if vine else ''}"
 
 
-def fails_most_text(
-    condition: Mapping[str, Any], rms_m: float, floor_m: float, worst_residual_m: float, worst_sigma_m: float, z: float
-) -> str:
+def fails_most_text(worst_residual_m: float, worst_sigma_m: float, **facts: Any) -> str:
     """Return where a model fails most, and by how much."""
-    scatter = "without replicates"
-    if math.isfinite(floor_m):
-        scatter = f"where replicates scatter by {1e3 * floor_m:.2g} mm"
     digits = decimals(1e3 * worst_sigma_m)
     off = f"{1e3 * abs(worst_residual_m):.{digits}f} ± {1e3 * worst_sigma_m:.{digits}f} mm"
-    return (
-        f"The model fails most at {_condition_text(**condition)}: root mean square {1e3 * rms_m:.2g} mm {scatter};"
-        f" there the vine is {off} {'ahead of' if worst_residual_m > 0 else 'behind'} the model ({z:.1f} σ in all)."
-    )
+    facts |= {"off": off, "is_ahead": worst_residual_m > 0, "is_repeated": math.isfinite(facts["floor_m"])}
+    return sentence("fails_most_at", facts)
 
 
 def drift_condition(column: str) -> tuple[str, str, float]:
@@ -502,40 +455,19 @@ def drift_condition(column: str) -> tuple[str, str, float]:
 
 def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: float = math.nan) -> str:
     """Return how a parameter drifts: a row of the table, whether it rises steadily, the error of the sheet."""
-    against, z, start, stop = (row[name] for name in ("against", "z", "from_level", "to_level"))
+    against, start, stop = (row[name] for name in ("against", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
-    if against == "sheet":
-        return (
-            f"{who} is pulled from the {start / 1e3:.2f} ± {stated_sigma_Pa / 1e3:.2f} kPa of the sheet to"
-            f" {stop / 1e3:.2f} kPa ({z:.1f} σ)."
-        )
     change, error = 100 * row["change"], 100 * row["change_sigma"]
     digits = max(decimals(error) - 1, 0)
-    amount = f"{change:.{digits}f} ± {error:.{digits}f} %"
+    facts = {**row, "who": who, "amount": f"{change:.{digits}f} ± {error:.{digits}f} %"}
+    if against == "sheet":
+        return sentence("drifts_from_sheet", facts | {"sigma_Pa": stated_sigma_Pa})
     if against == "growth":
-        larger, smaller = ("second", "first") if stop > start else ("first", "second")
-        return (
-            f"{who} would have to be {amount} larger in the {larger} half of the growth than in the {smaller}"
-            f" ({z:.1f} σ), though it should not change along the growth."
-        )
-    name, shown, times = drift_condition(against)
-    if steady:
-        return (
-            f"{who} rises by {amount} from {start * times:.3g} {shown} to {stop * times:.3g} {shown} of {name}"
-            f" ({z:.1f} σ), though it should not depend on the {name}."
-        )
-    low, high = sorted((start * times, stop * times))
-    return (
-        f"{who} is not the same at every {name} ({row['z_constancy']:.1f} σ), without rising or falling steadily from"
-        f" {low:.3g} {shown} to {high:.3g} {shown}."
-    )
-
-
-def like_no_law_text(law: str, explained: float, variable: str, alone: float) -> str:
-    """Return that no simple law describes the missing force, and the variable that a force of it alone explains it."""
-    text = f"What is missing looks like none of the simple laws: the best, {law}, explains {explained:.0%} of it."
-    depends = f" It depends on {_variables_text(variable)}: a force of that alone explains {alone:.0%}."
-    return text + depends if alone else text
+        return sentence("drifts_along_growth", facts | {"later": stop > start})
+    name, unit, times = drift_condition(against)
+    low, high = (start, stop) if steady else sorted((start, stop))
+    facts |= {"name": name, "low": f"{low * times:.3g} {unit}", "high": f"{high * times:.3g} {unit}"}
+    return sentence("rises_with" if steady else "is_not_constant", facts)
 
 
 def _variables_text(name: str) -> str:
@@ -546,40 +478,16 @@ def _variables_text(name: str) -> str:
 
 
 def learned_force_text(
-    name: str,
-    weights: Mapping[str, float],
-    alternatives: Sequence[str],
-    begins: str,
-    range_N: tuple[float, float],
-    sigma_N: float,
-    explained: float,
-    is_repeated: bool,
-    has_pressures: bool,
+    name: str, weights: Mapping[str, float], alternatives: Sequence[str], range_N: tuple[float, float], **facts: Any
 ) -> str:
     """Return the variables of the learned force and how certain they are, its range and error, from where it is
     measured, what limits the result, and which trials would help.
     """
     shares = {one: f" (posterior weight {weights[one]:.0%})" for one in weights}
     choices = joined([f"{_variables_text(one)}{shares.get(one, '')}" for one in (name, *alternatives)], "or by")
-    low, high = range_N
-    text = (
-        f"Learned as a smooth function inside the fit, the missing force is described by {choices}. As a function of"
-        f" {_variables_text(name)} it ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard"
-        f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit."
-    ).replace("-", "−")
-    if begins:
-        text += f" Where growth begins it is {begins}: B, n and P_y could account for a part that is constant."
-    else:
-        text += " These trials do not decide how much of it belongs to B, n and P_y."
-    if not is_repeated:
-        text += " No condition was repeated: how sure this is rests on the scatter that the fit assumes."
-    if not has_pressures:
-        text += " All trials had one pressure, so they do not show whether the force depends on it."
-    if alternatives:
-        text += (
-            " Trials that reach the same growth at another speed or time, by another pressure or payload, would tell."
-        )
-    return text
+    low, high = (f"{end_N:.2f}".replace("-", "−") for end_N in range_N)
+    facts |= {"name": name, "choices": choices, "alternatives": alternatives, "low": low, "high": high}
+    return sentence("force_is_learned", facts)
 
 
 def proposal_lines(proposal: Proposal) -> list[str]:
@@ -598,12 +506,9 @@ def proposal_lines(proposal: Proposal) -> list[str]:
     else:
         lines.append(f"{proposal.reason}{'' if proposal.table else '; nothing is proposed'}.")
     if (table := proposal.table) is not None:
-        lines.append(
-            f"No formula in the list reproduces the learned force. As a table ({table.effect.name}) it reduces χ² per"
-            f" point from {proposal.before.chi2_per_dof:.1f} to {table.ratio.fit.chi2_per_dof:.1f}; the error on"
-            f" left-out conditions, with the table itself learned from all trials, is {1e3 * table.rms_left_out_m:.2f}"
-            " mm."
-        )
+        before, after = proposal.before.chi2_per_dof, table.ratio.fit.chi2_per_dof
+        facts = {"name": table.effect.name, "before": before, "after": after, "rms_m": table.rms_left_out_m}
+        lines.append(sentence("no_formula_but_a_table", facts))
     return lines
 
 
@@ -623,11 +528,7 @@ def learned_file_text(learned: LearnedForce, origin: str) -> str:
         f"{_variables_text(name)} from {low * shown[name][2]:.3g} to {high * shown[name][2]:.3g} {shown[name][1]}"
         for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
     ]
-    validity = (
-        f"It is valid for {joined(ranges)}, the range that trials visited; outside, it keeps its value at the edge,"
-        " which has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
-        " reproduces these trials but explains nothing: look at its figure, and find the formula."
-    )
+    validity = sentence("valid_where_learned", {"ranges": ranges})
     symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))
     formula = f"tail force a T({symbols}), T the sum of {counts} cubic splines on even steps"
     title = f"Learned force: a table over {_variables_text(domain.name)}, no law."
@@ -669,56 +570,46 @@ def speed_band_text(share: Band) -> str:
     return f"{number(share.low)} to {number(share.high)} m/s"
 
 
-def _at_place(y_over_L: float) -> str:
-    return "" if y_over_L == 1 else f" at y/L = {y_over_L:g}"
+def _sizes(changes: Sequence[tuple[str, float, str]], by: str) -> list[str]:
+    """Names of numbers with the sizes of their changes, in display units."""
+    sized = [(name, f"{size * times:.2g} {u}") for name, size, unit in changes for u, times in [display_unit(unit)]]
+    return [f"{name} {by} {size}".rstrip() for name, size in sized]
 
 
 def _of_draws(share: float) -> str:
     return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
 
 
-def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
-    """Names of numbers and sizes of their changes, in display units."""
-    return [(name, f"{size * by:.2g} {u}".rstrip()) for name, size, unit in changes for u, by in [display_unit(unit)]]
-
-
-def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -> str:
-    """Return the message that an error of the film's mass matters as much as the errors stated."""
-    listed = ", ".join(f"{name} by {size}" for name, size in _with_sizes(changes)[:4])
-    more = f", and {len(changes) - 4} more" if len(changes) > 4 else ""
-    return (
-        f"these errors assume the stated mass of the film; an error of {100 * error:g} % in each vine would change"
-        f" {listed}{more}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3"
-    )
-
-
-def _recordings(trials: Sequence[str]) -> str:
-    return f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
-
+# Facts in words, by the names that `sentences.csv` gives them in place of a format
+FORMS: dict[str, Callable[[Any], str]] = {
+    "and": joined,
+    "list": ", ".join,
+    "rivals": "; ".join,
+    "sum": " + ".join,
+    "code": lambda names: f"`{'` and `'.join(names)}`",
+    "number": number,
+    "word": lambda count: ("two", "three", "four", "five")[count - 2],
+    "scatter": lambda changes: ", ".join(_sizes(changes, "by ±")),
+    "changes": lambda changes: (
+        ", ".join(_sizes(changes[:4], "by")) + (f", and {len(changes) - 4} more" if len(changes) > 4 else "")
+    ),
+    "remedy": lambda source: SHARED_REMEDIES[source],
+    "condition": lambda condition: _condition_text(**condition),
+    "variables": _variables_text,
+    "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
+    "draws": _of_draws,
+    "percent": percent,
+    "trials": trials_in_words,
+    "separated": lambda if_true: ", ".join(
+        f"{pair.replace(' | ', ' from ')} by {min(by_truth.values()):.2g} σ" for pair, by_truth in if_true.items()
+    ),
+    "recordings": lambda trials: (
+        f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
+    ),
+}
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
-    "film_matters": film_matters_text,
-    "spread_taken": lambda name, spread: (
-        f"the between-trial standard deviation of {name} is taken as {100 * spread:.2g} %"
-    ),
-    "not_constrained": lambda title, wider: (
-        f"{title}: the trajectories do not constrain it beyond the value in the sheet"
-        + ("; trials disagree by more than their noise, so its error is larger than in the sheet" if wider else "")
-    ),
-    "not_separable": lambda names: f"these data do not determine separate values of {', '.join(names)}",
-    "misfit": lambda ratio, may_vary: (
-        f"the residuals are {ratio:.3g} times the noise of the tracks"
-        f"{f', although {joined(may_vary)} may vary from trial to trial' if may_vary else ''}: an effect is missing, or"
-        " the tracks have slow errors larger than their noise"
-    ),
-    "mostly_shared": lambda names, source: (
-        f"most of the error of {', '.join(names)} comes from what all trials share: {SHARED_REMEDIES[source]}"
-    ),
-    "trials_disagree": lambda differences: (
-        "trials disagree by more than their noise, in "
-        f"{', '.join(f'{name} by ± {size}' for name, size in _with_sizes(differences))}: they get nearly equal weights"
-    ),
     "pressures_corrected": lambda count, largest_kPa: (
         f"recorded pressures of {f'{count} trials' if count > 1 else 'one trial'} are corrected by up to"
         f" {largest_kPa:.2g} kPa, within the errors that the noise of the gauge leaves, to agree with the motion"
@@ -727,29 +618,9 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
         " body that moves as a whole has none"
     ),
-    "columns_partly_blank": lambda columns: (
-        f"it needs `{'` and `'.join(columns)}`, which the sheet leaves blank for some trials"
-    ),
-    "implausible_size": lambda symbol, value, unit, low, high: (
-        f"it would need {symbol} = {f'{value:.3g} {unit}'.strip()}, and {low:.3g} to {high:.3g} is plausible"
-    ),
-    "several_missing": lambda count: (
-        f"{('two', 'three', 'four', 'five')[count - 2]} effects are missing: none alone removes the misfit"
-    ),
-    "not_tried": lambda names: f"Not tried, because the sheet does not state what they need: {joined(names)}.",
-    "left_out_error_does_not_fall": lambda name, without_m, with_m: (
-        f"Against this verdict: The error on left-out conditions does not fall with {name}: {1e3 * without_m:.2f} mm"
-        f" without it, {1e3 * with_m:.2f} mm with it. The data support {name} by the shape of the motion alone."
-    ),
-    "still_drifts": lambda model, drift: f"Against this verdict: With {' + '.join(model)}: {drift}",
     "left_out_error_without": lambda left_out, count, reason: (
         f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
         f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
-    ),
-    "medians_and_bands": lambda model, samples: f"{' + '.join(model)}; medians and 90 % bands of {samples} draws",
-    "fastest_by": lambda quantity, y_over_L, share, burst_MPa, kPa: (
-        f"fastest by {quantity}{_at_place(y_over_L)}; hoop stress up to {share:.0%} of {burst_MPa:g} MPa, supply up to"
-        f" {kPa:g} kPa"
     ),
     "sweeps": lambda trial, swept_m3, in_full: (
         f"{trial_text(trial) if in_full else _size_text(trial)}: it sweeps {volume_text(swept_m3)}"
@@ -757,13 +628,6 @@ REMARKS: dict[str, Callable[..., str]] = {
     "supplied_chambers": lambda ms, volumes: (
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
-    ),
-    "speeds_at_medians": lambda y_over_L, m_s: (
-        f"speed: final speed at the medians{_at_place(y_over_L)}; {number(m_s)} m/s at constant pressure"
-    ),
-    "goes_slack": lambda share: (
-        f"the tail goes slack on the way {_of_draws(share)}: tail speeds are then those of the film at the tip, and a"
-        " payload falls freely, at a speed that is not predicted"
     ),
     "tail_compressed": lambda share, median_N, low_N, has_payload: (
         f"the model predicts compression in the tail {_of_draws(share)} (least tension {median_N:.2g} N"
@@ -774,37 +638,16 @@ REMARKS: dict[str, Callable[..., str]] = {
     ),
     "odd_trials": odd_in_words,
     "odd_trials_decide": odd_deciding_in_words,
-    "frames_missing": lambda trials: (
-        f"Frames are missing from {_recordings(trials)}: the edge moves much farther from one frame to the next than in"
-        " the frames around them, so the camera or the disk dropped frames. The times were corrected; record again"
-        " where it matters."
-    ),
-    "frames_perhaps_missing": lambda trials: (
-        f"Frames may be missing from {_recordings(trials)}: the edge moves farther from one frame to the next than in"
-        " the frames around them, and the later times were shifted accordingly. Points farther away are too few or too"
-        " noisy to confirm it: look at the recording."
-    ),
     "deciding_measurements": measurement_text,
     "measure_first": lambda faults, measurement: (
         f"Measure before making more trials: {joined(faults)} {'are errors' if len(faults) > 1 else 'is an error'} of"
         f" measurement. {measurement}"
     ),
-    "no_feasible_trial": lambda measurement: f"No trial within the limits can be made and simulated. {measurement}",
     "trials_to_make": advice_text,
-    "no_trials_separate": partial(advice_text, worth_it=False),
     "diagnosis_page": diagnosis_page,
     "law": law_text,
-    "fails_nowhere": lambda z, condition: (
-        "In no condition does the mean of the replicates deviate from the model by more than their scatter explains"
-        f" (at most {z:.1f} σ, at {_condition_text(**condition)})."
-    ),
     "fails_most": fails_most_text,
     "drifts": drift_text,
-    "like_no_law": like_no_law_text,
-    "like_a_law": lambda law, explained, others: (
-        f"What is missing looks like {law}; that explains {explained:.0%} of what any force could."
-        + (f" These data fit nearly as well with: {'; '.join(others)}." if others else "")
-    ),
     "learned_force": learned_force_text,
     "learned_file": learned_file_text,
     "law_file": lambda law, formula, origin: _file_text(

@@ -33,6 +33,7 @@ from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.inference.robust_covariance import FILM_ERROR
+from vinetrack.narrative import sentence
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -217,7 +218,7 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     """Sizes of what was added, else of the members of the answer set."""
     if diagnosis.effects:
         added = [p for p in diagnosis.parameters if p.key.split(".")[0] in diagnosis.effects]
-        wider = [f"{interval_text(p)}{_confounded_interval(diagnosis, p)}" for p in added]
+        wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in added]
         return ", ".join(map(split_estimate, added)), "; ".join([*wider, *_shared_remedies(added)])
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
     return "; ".join(f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]), ""
@@ -229,7 +230,7 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
     with_them = [f"with {listed_names(diagnosis.effects)} in the model"] if law and diagnosis.effects else []
-    notes = [*(f"n {interval_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
+    notes = [*(f"n 95 %: {bounds_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
 
@@ -377,17 +378,14 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
-def interval_text(entry: Number) -> str:
-    """Return the 95 % interval of a fitted number, said to be one, in its display unit."""
-    return f"95 %: {bounds_text(entry, display_unit(entry.unit)[0])}"
-
-
-def bounds_text(entry: Number, unit: str = "") -> str:
+def bounds_text(entry: Number, with_unit: bool = False) -> str:
     """Return the ends of the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
-    factor = display_unit(entry.unit)[1]
+    unit, factor = display_unit(entry.unit)
     if not (is_finite(entry.low) and is_finite(entry.high)):
         return "open"
-    text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
+    text = (
+        f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)}{f' {unit}' if with_unit else ''}".strip()
+    )
     ends = entry.ends_at
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
@@ -400,16 +398,12 @@ def sizes_in_words(numbers: Sequence[Number]) -> str:
     return ", ".join(map(estimate_text, numbers))
 
 
-# The first sentences of an explanation, by verdict; those of an adequate and of an unexplained model take more
+# Codes of the first sentence of an explanation, by verdict; those of an adequate and of an unexplained model take more
 _EXPLAINED = {
-    MISSING: "{name} is missing from {model}: with {sizes} the fit to {trials} improves by Δχ² = {gain:.0f}"
-    " ({sigma:.1f} σ).",
-    AMBIGUOUS: "{model} lacks an effect, and these data cannot tell which: {hypotheses}. Their fits to {trials} lie"
-    " within Δχ² = 9 of each other{by_film}.",
-    BETWEEN_TRIALS: "The trials differ from each other, and no effect is missing from {model}: {hypotheses}. That"
-    " explains the misfit of {trials} (Δχ² = {gain:.0f}).",
-    ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit of {model} to {trials}:"
-    " {hypotheses}. It is not added to the model: find the fault and measure again, or correct the sheet.",
+    MISSING: "is_missing",
+    AMBIGUOUS: "is_ambiguous",
+    BETWEEN_TRIALS: "trials_differ",
+    ARTEFACT: "is_a_fault",
 }
 
 
@@ -423,16 +417,10 @@ def explain(step: SelectionStep) -> str:
     if verdict == ARTEFACT and trials_differ(step.answer_names):
         verdict = BETWEEN_TRIALS
     best = answers[0]
-    text = _EXPLAINED[verdict].format(
-        name=best.names[0] if step.note else best.names[-1],
-        sizes=sizes_in_words(best.numbers) or "it",
-        model=model,
-        trials=trials,
-        gain=best.delta_chi2,
-        sigma=abs(best.sigma),
-        hypotheses=_hypotheses(answers),
-        by_film=_by_film(answers),
-    )
+    facts: dict[str, Any] = {"name": best.names[0] if step.note else best.names[-1], "model": model, "trials": trials}
+    facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
+    facts |= {"hypotheses": _hypotheses(answers), "by_film": _by_film(answers)}
+    text = sentence(_EXPLAINED[verdict], facts)
     if step.note:
         note = str(step.note)
         text += f" {note[0].upper()}{note[1:]} ({' and '.join(best.names)} together do)."
@@ -449,21 +437,16 @@ def explain(step: SelectionStep) -> str:
 
 
 def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
-    text = (
-        f"The misfit of {model} exceeds the noise of {trials}, and neither any one effect of the catalogue nor any "
-        "combination of the best explains it."
-    )
+    text = sentence("nothing_explains", {"model": model, "trials": trials})
     for name, why in step.rejected:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     if not step.partial:
         return text
     last = step.partial[-1]
     added = joined([f"{each.names[-1]} (Δχ² = {each.delta_chi2:.0f} in all)" for each in step.partial], "then")
-    return (
-        f"{text} Adding {added} explains a part: χ² per degree of freedom falls from {step.tests.fit.chi2_per_dof:.1f} "
-        f"to {last.fit.chi2_per_dof:.1f}, with {sizes_in_words(last.numbers)}. A significant misfit remains, so none of"
-        " them is shown to be missing."
-    )
+    facts: dict[str, Any] = {"added": added, "sizes": sizes_in_words(last.numbers)}
+    facts |= {"before": step.tests.fit.chi2_per_dof, "after": last.fit.chi2_per_dof}
+    return f"{text} {sentence('a_part_is_explained', facts)}"
 
 
 def _slips(answers: Sequence[LikelihoodRatio]) -> str:
@@ -488,10 +471,7 @@ def _by_film(answers: Sequence[LikelihoodRatio]) -> str:
     if not only_by_film:
         return ""
     names = joined([ratio.label.replace("+", " with ") for ratio in only_by_film])
-    return (
-        f", {names} only if the film weighs about {100 * FILM_ERROR:.0f} % more or less than thickness and density "
-        "give: weigh a piece of it"
-    )
+    return sentence("only_by_film", {"names": names, "error": FILM_ERROR})
 
 
 def _with_the_fault(step: SelectionStep) -> str:

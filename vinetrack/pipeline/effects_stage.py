@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import Problem
+from vinetrack.core.problems import Problem, remark
 from vinetrack.core.tables import safe_join, write_text
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import check_needs, make_model
@@ -84,29 +84,23 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, say: R
     if diagnosis.contradicted_columns:
         raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
-        raise ResultsError(
-            f"{folder}: its verdict is `{diagnosis.final_verdict}`. A new law is proposed only for a misfit that no"
-            " effect of the catalogue explains (`unexplained`); `vinetrack diagnose` prints the diagnosis."
-        )
+        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.final_verdict)))
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
     pairs, _ = measured_trials(experiment, results)
     proposal = propose(model, pairs, say)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
-    origin = (
-        f"From {len(proposal.before.trials)} trials of {experiment.name}. RMS error in left-out conditions:"
-        f" {' + '.join(model.names)} {1e3 * proposal.rms_left_out_m:.2f} mm; with this"
-    )
+    facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}
+    facts |= {"before_m": proposal.rms_left_out_m}
     files = []
     if proposal.tied:
         best = proposal.tied[0]
-        remark = f"{origin} law {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
-        files.append((best.effect.path.name, effect_text(best.law, remark)))
-    if proposal.table is not None:
-        table = proposal.table
-        remark = f"{origin} table, which was learned from all of them, {1e3 * table.rms_left_out_m:.2f} mm."
-        files.append((table.effect.path.name, table_text(table.learned, remark)))
+        origin = remark("law_origin", **facts, rms_m=best.rms_left_out_m, gain=best.ratio.delta_chi2)
+        files.append((best.effect.path.name, effect_text(best.law, str(origin))))
+    if (table := proposal.table) is not None:
+        origin = remark("table_origin", **facts, rms_m=table.rms_left_out_m)
+        files.append((table.effect.path.name, table_text(table.learned, str(origin))))
     paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
     if to is not None and paths:
         paths[0] = to

@@ -149,14 +149,9 @@ def diagnose_results(job: Job, fitted: Fit | None) -> str:
     try:
         diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
     except Exception as error:
-        reason = _reason(error)
+        reason, pairs = _reason(error), ()
         explanation = f"No diagnosis could be made: {reason}"
-        refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
-        _emptied(results.folder / "diagnosis")
-        write_csv(results.ladder, empty_table(LADDER_COLUMNS))
-        write_json(results.diagnosis, {**refusal.to_json(), "model": list(job.experiment.settings.model)})
-        log.info("%s", explanation)
-        return explanation
+        diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     job.say("fitting the damping law under every model")
     write_diagnosis(results, diagnosis, pairs, job.settings)
@@ -209,7 +204,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
-    for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]):
+    for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]

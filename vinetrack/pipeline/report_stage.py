@@ -1,44 +1,250 @@
-"""The report of a results folder: one page with its tables and figures."""
+"""What the report of a results folder shows: clips of its recordings, figures, the comparison with the paper, the page;
+and the same of a single recording, without an experiment.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
+from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, with_flag
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
-from vinetrack.experiment.folder import describe_run
-from vinetrack.experiment.settings import FigureSettings
+from vinetrack.core.terminal import table
+from vinetrack.core.units import number
+from vinetrack.experiment.folder import Experiment, describe_run
+from vinetrack.experiment.settings import (
+    ExperimentSettings,
+    FigureSettings,
+    OverlaySettings,
+    read_experiment_settings,
+)
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.registry import FigureTables, campaign_figures, draw, figures_of
-from vinetrack.figures.style import blank, render
+from vinetrack.figures.style import GREEN, render
+from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.paper import rows as paper
 from vinetrack.paper.motions import comparison_tables
-from vinetrack.pipeline.overlays_stage import draw_overlays
 from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import build_report, report_content, tally
-from vinetrack.results.folder_layout import Results, read_fit, read_json, read_result
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    read_diagnosis,
+    read_fit,
+    read_json,
+    read_result,
+    read_source_experiment,
+)
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.survey import Measurement, measure_recording
+from vinetrack.video.write import write_clip
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from vinetrack.core.records import Trial
+    import pandas as pd
 
 
 log = logging.getLogger(__name__)
+
+
+def write_report(job: Job) -> list[str]:
+    """Draw what the report shows, and write `provenance.json` and `report.html`."""
+    lines = compare_with_paper(job) if job.experiment.settings.published else []
+    lines += [*draw_overlays(job), *draw_figures(job)]
+    job.say("writing the report")
+    experiment, results = job.experiment, Results(job.results)
+    settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
+    inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
+    provenance = describe_run(experiment.folder, inputs, settings, experiment.settings.model)
+    page = build_report(report_content(experiment, job.results, provenance))
+    write_json(results.provenance, provenance)
+    write_text(results.report, page)
+    return [*lines, f"Report: {results.report}"]
+
+
+# ------------------------------------------------------------------------------
+# Slowed-down clips of recordings with tracked and modelled edges, `overlays/<trial>.mp4`.
+
+MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chosen)
+FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a prediction into the picture (derived)
+
+
+def draw_overlays(job: Job) -> list[str]:
+    """Write the clips that the settings request, and again those that there are; a line for each that could not be."""
+    experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
+    chosen = chosen_trials(experiment, results, settings.of)
+    for path in results.overlays.glob("*.mp4"):  # of a trial that is not tracked any more
+        if path.stem not in chosen:
+            path.unlink()
+    work = partial(_try_overlay, results=results, settings=settings)
+    messages = []
+    for count, line in enumerate(map_unordered(work, [experiment.trial(name) for name in chosen], job.threads), 1):
+        messages += [f"  {line}"] if line else []
+        job.say(f"{count} of {len(chosen)} clips")
+    return sorted(messages)
+
+
+def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
+    """Write the clip of one trial of a results folder with the settings of its run; return its path."""
+    results, read = Results(folder), read_source_experiment(folder, experiment)
+    filmed = [one.name for one in read.trials if one.video is not None]
+    if trial not in filmed:
+        existing = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there are none"
+        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {existing}")
+    of_run = read_json(results.provenance).get("settings") or {}
+    asked = {"seconds": seconds} if math.isfinite(seconds) else {}
+    return _write_overlay(read.trial(trial), results, OverlaySettings(**(of_run.get("overlays") or {}) | asked))
+
+
+def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
+    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none; and those
+    whose clip is there already, which would show another model otherwise.
+    """
+    trials = read_result(results.trials)
+    tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
+    filmed = {trial.name: trial.condition for trial in experiment.trials if trial.video and trial.name in tracked}
+    first = {condition: name for name, condition in reversed(filmed.items())}
+    wanted: dict[str, Collection[str]] = {"all": filmed.keys(), "one_per_condition": first.values(), "none": ()}
+    return [name for name in filmed if name in wanted[of] or results.overlay(name).exists()]
+
+
+def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:
+    """Write the clip of one trial; return why it could not be made, or blank."""
+    try:
+        _write_overlay(trial, results, settings)
+    except Exception as error:
+        log.exception("%s: no clip", trial.name)
+        return f"{trial.name}: no clip: {error if isinstance(error, ResultsError) else INTERNAL_ERROR}"
+    return ""
+
+
+def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
+    """Write the clip of one trial; return its path."""
+    track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
+    shown, line = frames_to_show(track), analysed["axis"]
+    mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
+    shake_px = shake_along(line, len(track))
+    edges, release_s = edges_to_draw(trial.name, results, track)
+    edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
+    since_s = track["time_s"].to_numpy(dtype=float) - release_s
+    scale = 1e3 * trial.diameter_m / mm_per_px, mm_per_px
+    path = results.overlay(trial.name)
+    try:
+        assert trial.video is not None
+        recording = inspect_recording(trial.video)
+        _write_clip(path, trial.name, recording, axis_from_entry(line), *scale, edges, since_s, shown, settings)
+    except RecordingError as error:
+        raise ResultsError(str(error)) from None
+    return path
+
+
+def _write_clip(
+    path: Path, title: str, recording: Recording, axis: Axis, tube_px: float, mm_per_px: float, edges: list[Edge],
+    since_s: Floats, shown: range, settings: OverlaySettings,
+) -> None:  # fmt: skip
+    """Write a clip of the shown frames; `since_s` is the time since release. Shapes: since_s (n_frames,)."""
+
+    def drawn() -> Iterator[NDArray[np.uint8]]:
+        low = high = 0.0
+        for frame, picture in islice(enumerate(iterate_frames(recording)), shown.start, shown.stop, stride):
+            if high == low:
+                low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
+            yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]))
+
+    rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
+    play_fps, stride = playback_rate(len(shown), settings.seconds)
+    size = recording.width, recording.height
+    tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
+    view = ClipView(title, axis, edges, tube_px, size, mm_per_px, rate / play_fps / stride, settings.width_px)
+    write_clip(path, drawn(), play_fps)
+
+
+def frames_to_show(track: pd.DataFrame) -> range:
+    """Return the range of frames in which the edge moves, with `MARGIN_FRAMES` before and after."""
+    edge = track["edge_px"].to_numpy(dtype=float)
+    tracked = np.flatnonzero(np.isfinite(edge))
+    if tracked.size < FEWEST_POINTS:
+        raise ResultsError("its edge was not found, so there is nothing to draw")
+    low, high = float(np.nanmin(edge)), float(np.nanmax(edge))
+    start = tracked[edge[tracked] > low + 0.01 * (high - low)][0]
+    end = tracked[edge[tracked] < high - 0.002 * (high - low)][-1]
+    return range(max(int(start) - MARGIN_FRAMES, 0), min(int(end) + MARGIN_FRAMES, int(tracked[-1])) + 1)
+
+
+def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
+    """Return frames per second of a clip of about `seconds`, and of how many frames of the film it shows one."""
+    fastest_fps, slowest_fps = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
+    stride = max(round(n_frames / seconds / fastest_fps), 1)
+    return float(np.clip(n_frames / stride / seconds, slowest_fps, fastest_fps)), stride
+
+
+def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
+    """Return the shift of each frame along the axis by camera shake, px, shape (n_frames,); 0 at rest."""
+    stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
+    return np.pad(stored_px, (0, n_frames - stored_px.size))
+
+
+def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
+    """Return the tracked edge, the predicted edges if there are any, and the time of release, s."""
+    edge_px = track["edge_px"].to_numpy(dtype=float)
+    edges, first_moving = [Edge("tracked edge", TRACKED, edge_px)], frames_to_show(track).start + MARGIN_FRAMES
+    release_s = float(track["time_s"].iloc[min(first_moving, len(track) - 1)])
+    path = results.predictions(trial)
+    if path.exists():
+        predicted, to_px = read_result(path), position_to_px(track)
+        diagnosis = read_diagnosis(results)
+        added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
+        models = [("model_before_m", "initial model", BEFORE, 2.0)]
+        models += [("model_after_m", f"with {added}", AFTER, 1.4)] if added else []
+        time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+        for column, label, colour, reach in models:
+            prediction = predicted[["time_s", column]].dropna()
+            if not prediction.empty:
+                # There is no prediction before the first and after the last frame of the fit.
+                ends = {"left": math.nan, "right": math.nan}
+                position_m = np.interp(time_s, prediction["time_s"], prediction[column], **ends)
+                edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m), reach))
+        fitted = read_fit(results).trials if results.fit.exists() else {}
+        release_s = fitted[trial].release_s if trial in fitted else release_s
+    by_hand = with_flag(track["flag"], "corrected")
+    if by_hand.any():
+        edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan)))
+    return edges, release_s
+
+
+def position_to_px(track: pd.DataFrame) -> Any:
+    """Return the quadratic (lens, tilt) that converts metres to pixels along the axis, fitted to a track."""
+    both = track[["lead_position_m", "edge_px"]].dropna()
+    metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)
+    if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
+        raise ResultsError("too few of its positions are known in pixels and in metres")
+    middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
+    return np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
+
 
 # ------------------------------------------------------------------------------
 # Figures of the whole experiment.
 
 
-def draw_campaign(job: Job) -> list[str]:
+def draw_figures(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
     job.say("drawing figures")
     import_module("matplotlib.backends.backend_svg")  # once, before processes are forked
-    shares = [list(campaign_figures())[first :: job.threads] for first in range(job.threads)]
+    names = [*campaign_figures(), *(figures_of("paper") if job.experiment.settings.published else ())]
+    shares = [names[first :: job.threads] for first in range(job.threads)]
     work = partial(_drawn, folder=job.results, trials=job.experiment.trials, settings=job.settings.figures)
     return [f"{sum(map_unordered(work, shares, job.threads))} figures."]
 
@@ -49,23 +255,19 @@ def _drawn(names: Sequence[str], folder: Path, trials: tuple[Trial, ...], settin
     for name in names:
         for form in ("png", "svg", "pdf"):
             tables.results.figure(name, f".{form}").unlink(missing_ok=True)
-        if picture := draw(name, tables):
-            _write(picture, partial(tables.results.figure, name), settings)
+        if figure := draw(name, tables):
+            for form, data in render(figure, settings.formats, settings.dpi).items():
+                write_bytes(tables.results.figure(name, f".{form}"), data)
             count += 1
     return count
 
 
-def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
-    for form, data in render(figure, settings.formats, settings.dpi).items():
-        write_bytes(path(f".{form}"), data)
-
-
 # ------------------------------------------------------------------------------
-# Comparison of a results folder with the published numbers and figures: `paper.csv`, figures, and their tables.
+# Comparison of a results folder with the published numbers and figures: `paper.csv`, and the tables of the figures.
 
 
 def compare_with_paper(job: Job) -> list[str]:
-    """Write `paper.csv`, and the tables and figures of the comparison."""
+    """Write `paper.csv`, and the tables of the figures of the paper."""
     experiment, results = job.experiment, Results(job.results)
     mark = paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED
     fit = read_fit(results)
@@ -89,25 +291,133 @@ def compare_with_paper(job: Job) -> list[str]:
     table = paper.as_table(rows)
     for name, content in {**tables, "paper": table}.items():
         write_csv(results.folder / f"{name}.csv", content)
-    for mark in paper.MARKS:
-        log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
-    shown = FigureTables(results.folder, ())
-    for name in figures_of("paper"):
-        drawn = draw(name, shown) or blank("No trial of this experiment is compared with this figure.")
-        _write(drawn, partial(results.figure, name), job.settings.figures)
     return [f"Comparison with the paper: {tally(table)}"]
 
 
-def write_report(job: Job) -> list[str]:
-    """Draw what the report shows, and write `provenance.json` and `report.html`."""
-    lines = [*draw_overlays(job), *draw_campaign(job)]
-    lines += compare_with_paper(job) if job.experiment.settings.published else []
-    job.say("writing the report")
-    experiment, results = job.experiment, Results(job.results)
-    settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
-    inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
-    provenance = describe_run(experiment.folder, inputs, settings, experiment.settings.model)
-    page = build_report(report_content(experiment, job.results, provenance))
-    write_json(results.provenance, provenance)
-    write_text(results.report, page)
-    return [*lines, f"Report: {results.report}"]
+# ------------------------------------------------------------------------------
+# The command `vinetrack track`: the leading edge of a single recording as a table, a strip figure and a clip.
+
+
+def track_file(
+    path: Path, *, capture_fps: float = math.nan, exposure_us: float = math.nan, mm_per_px: float = math.nan,
+    calibration: Path | None = None, axis: PictureAxis | None = None, frames_used: tuple[int, int] | None = None,
+    body: bool = False, out: Path | None = None,
+) -> tuple[list[str], dict[str, Any]]:  # fmt: skip
+    """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
+    given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns the facts as lines and as JSON.
+    """
+    if out is not None and out.exists() and not out.is_dir():
+        raise UserError(f"{out}: is a file; name a folder with --out")
+    settings, folder = _settings_of(calibration, mm_per_px)
+    scaled = math.isfinite(mm_per_px) or calibration is not None
+    try:
+        recording = inspect_recording(path)
+        rate = capture_fps if recording.capture_fps is None else recording.capture_fps
+        if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
+            raise UserError(str(remark("other_rate_in_file", file=path.name, given=capture_fps, stated=rate)))
+        trial = Trial(
+            name=path.stem,
+            video=recording.path,
+            capture_fps=rate if math.isfinite(rate) else 1.0,
+            capture_fps_is_playback=True,
+            exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
+            # Without a scale, the unit of length is one pixel.
+            m_per_px=mm_per_px / 1e3 if scaled else 1.0,
+            travel_ratio=1.0 if body else 2.0,
+            axis=axis,
+            frames_used=frames_used,
+        )
+        measured = measure_recording(trial, settings, folder)
+    except RecordingError as error:
+        raise UserError(str(error)) from None
+    if not math.isfinite(rate):
+        track = measured.tracking.track
+        untimed = replace(track, time_s=np.full(len(track.time_s), math.nan))
+        measured = replace(measured, tracking=replace(measured.tracking, track=untimed))
+    written = _write(out or Path(f"{recording.path.stem}_track"), measured, scaled)
+    facts = _facts(measured, rate, 1e3 * measured.m_per_px if scaled else math.nan)
+    rows = {name: number(fact) if isinstance(fact, float) else str(fact) for name, fact in facts.items()}
+    ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
+    rows |= {"axis": "({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)}
+    lines = table([(name, text) for name, text in rows.items() if text not in ("–", "None") and name != "notes"])
+    lines += [] if math.isfinite(rate) else ["Capture rate unknown: without --capture-fps there are no times."]
+    lines += [f"warning: {note}" for note in facts["notes"]]
+    return [*lines, "Written: " + ", ".join(map(str, written.values()))], facts | {"written": written}
+
+
+def _settings_of(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
+    """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
+    if file is None:
+        return ExperimentSettings(), Path()
+    if math.isfinite(mm_per_px):
+        raise UserError("--mm-per-px and --calibration are two scales: give one")
+    file = file / "experiment.yaml" if file.is_dir() else file
+    calibration = read_experiment_settings(file).calibration
+    if calibration is None:
+        raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
+    return ExperimentSettings(calibration=calibration), file.parent
+
+
+def _write(folder: Path, measured: Measurement, scaled: bool) -> dict[str, Path]:
+    """Write the edge of every frame along the axis and in the picture, with errors, and in metres if there is a scale;
+    the strip; and the clip.
+    """
+    import pandas as pd
+
+    tracking, recording, m_per_px = measured.tracking, measured.recording, measured.m_per_px
+    track, axis, name = tracking.track, tracking.axis, recording.path.name
+    assert track.lead_position_systematic_m is not None
+    along_px = track.edge_px + tracking.shake_px
+    columns = {
+        "frame": np.arange(len(track.time_s)),
+        "time_s": track.time_s,
+        "edge_px": track.edge_px,
+        "edge_sigma_px": track.lead_position_sigma_m / m_per_px,
+        "edge_systematic_px": track.lead_position_systematic_m / m_per_px,
+        **dict(zip(("x_px", "y_px"), axis.points(along_px).T, strict=True)),
+    }
+    if scaled:
+        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
+        columns |= {"systematic_m": track.lead_position_systematic_m}
+    content = pd.DataFrame(columns | {"flag": track.flag})
+    written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
+    write_csv(written["table"], content)
+    m_per_px = m_per_px if scaled else math.nan
+    write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
+    shown, edges = frames_to_show(content), [Edge("tracked edge", TRACKED, along_px)]
+    since_s = track.time_s - track.time_s[min(shown.start + MARGIN_FRAMES, len(track.time_s) - 1)]
+    scale = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else axis.width_px, 1e3 * m_per_px
+    _write_clip(written["clip"], name, recording, axis, *scale, edges, since_s, shown, OverlaySettings())
+    return written
+
+
+def _facts(measured: Measurement, rate: float, mm_per_px: float) -> dict[str, Any]:
+    """What a recording is and what was found in it, by names with units; NaN or None where not known."""
+    recording, tracking, track = measured.recording, measured.tracking, measured.tracking.track
+    usable = np.isfinite(track.edge_px) & ~with_flag(track.flag, *UNUSABLE_FLAGS)
+    frame, edge_px = np.flatnonzero(usable), track.edge_px[usable]
+    growth_px = float(np.ptp(edge_px)) if frame.size else math.nan
+    fastest = float(np.nanmax(np.diff(edge_px) / np.diff(frame))) if frame.size > 1 else math.nan
+    sigma_px = track.lead_position_sigma_m[usable & ~with_flag(track.flag, "before_release")] / measured.m_per_px
+    return {
+        "recording": recording.path,
+        "width_px": recording.width,
+        "height_px": recording.height,
+        "bit_depth": recording.bit_depth,
+        "playback_fps": recording.playback_fps,
+        "capture_fps": rate,
+        "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
+        "duration_s": len(track.edge_px) / rate,
+        "n_frames": len(track.edge_px),
+        "n_known": frame.size,
+        "axis": axis_entry(tracking.axis),
+        "mm_per_px": mm_per_px,
+        "scale_rel_sigma": measured.scale_rel_sigma,
+        "tube_width_px": tracking.tube_width_px,
+        "growth_px": growth_px,
+        "growth_mm": mm_per_px * growth_px,
+        "fastest_px_per_frame": fastest,
+        "fastest_m_s": fastest * mm_per_px / 1e3 * rate,
+        "edge_sigma_px": float(np.nanmedian(sigma_px)) if np.isfinite(sigma_px).any() else math.nan,
+        "notes": list(track.notes),
+    }

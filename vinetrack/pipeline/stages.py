@@ -76,7 +76,7 @@ STAGES = {
         "trials:analyse_trials",
         ("steady", "velocity", "final_at_fraction", "efficiency_at_mm", "figures"),
         ("<experiment>", "<measurements>"),
-        ("<tracks>", "<kinematics>", "<analysed>", "<pictures>"),
+        ("<trials>",),
         "trials analysed",
         parallel=True,
     ),
@@ -84,7 +84,7 @@ STAGES = {
         "Fit the damping law and the model in use to all trials, audit neglected effects, and diagnose what it lacks.",
         "model_stage:fit_and_diagnose",
         ("steady", "velocity", "damping", "final_at_fraction", "efficiency_at_mm"),
-        ("<experiment>", "<tracks>", "<kinematics>", "<analysed>"),
+        ("<experiment>", "<trials>"),
         ("trials.csv", "conditions.csv", "steady.csv", "damping_points.csv", "damping.json", "scaling.json", "fit.json",
          "comparison.csv", "model_check.csv", "audit.csv", "comparison/", "diagnosis.json", "ladder.csv", "diagnosis/"),
         "model fitted and diagnosed",
@@ -93,7 +93,7 @@ STAGES = {
         "Draw the figures of the experiment and clips of its recordings, and write the report, a single file.",
         "report_stage:write_report",
         (),
-        ("<inputs>", "<tracks>", "<kinematics>", "<analysed>", "<pictures>", "<made of model>"),
+        ("<inputs>", "<trials>", "<made of model>"),
         ("report.html", "provenance.json"),  # which figures have content is not known in advance
         "report written",
         parallel=True,
@@ -137,8 +137,7 @@ def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_w
         yield from map(function, items)
         return
     # Forked on Linux, where workers are ready at once and share what is imported, and spawned elsewhere.
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     with ProcessPoolExecutor(min(n_workers, len(items)), mp_context=context, initializer=_end_with_parent) as pool:
         futures = [pool.submit(function, item) for item in items]
         try:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import INTERNAL_ERROR, InputError
+from vinetrack.core.problems import INTERNAL_ERROR, InputError, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_csv, write_json
 from vinetrack.dynamics.model import Model, make_model
@@ -25,7 +25,7 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_trial_motion
 from vinetrack.figures.overlay import draw_strip
-from vinetrack.figures.registry import describe_trial
+from vinetrack.figures.registry import features
 from vinetrack.figures.style import blank
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
 from vinetrack.kinematics.summary import TrialError, TrialResult, condition_table, summarise_trial
@@ -155,17 +155,13 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     track, kinematics = empty_table(TRACK_COLUMNS), empty_table(KINEMATICS_COLUMNS)
     if summary is not None:
         measured = summary.track
-        columns = (
-            np.arange(len(measured.time_s)),
-            measured.time_s,
-            measured.edge_px,
-            measured.lead_position_m,
-            measured.lead_position_sigma_m,
-            measured.flag,
-            measured.edge_px if measured.tracked_px is None else measured.tracked_px,
-            np.nan if measured.lead_position_systematic_m is None else measured.lead_position_systematic_m,
-        )
-        track = pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
+        unmoved, systematic_m = measured.tracked_px, measured.lead_position_systematic_m
+        columns = vars(measured) | {
+            "frame": np.arange(len(measured.time_s)),
+            "tracked_edge_px": measured.edge_px if unmoved is None else unmoved,
+            "lead_position_systematic_m": np.nan if systematic_m is None else systematic_m,
+        }
+        track = pd.DataFrame({column: columns[column] for column in TRACK_COLUMNS})
         kinematics = pd.DataFrame({column: getattr(summary.kinematics, column) for column in KINEMATICS_COLUMNS})
         point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
         windows = []
@@ -204,7 +200,7 @@ def _draw(
 
 def _described(name: str, trial: Trial | None) -> tuple[str, float]:
     """Title of the figure of a trial, and its travel ratio; `trial` is None if its row of the sheet is faulty."""
-    return (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
+    return (name, 2.0) if trial is None else (" · ".join([name, *features(trial)]), trial.travel_ratio)
 
 
 def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
@@ -225,8 +221,6 @@ def fit_damping(job: Job) -> list[str]:
     law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
     write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
     write_json(results.damping, law)
-    for method, fit in law.items():
-        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
     failed = int((table["status"] == "failed").sum())
     return [f"{len(table)} trials, {failed} failed.", damping_headline(law)]
 
@@ -246,8 +240,6 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     write_csv(results.points, mark_left_out(points))
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
-    for row in table.itertuples():
-        log.info("%s: %s %s", row.trial, row.status, row.reason)
     return table
 
 
@@ -262,12 +254,8 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
     }
     failed: dict[str, dict[str, Any]] = {}
     for names, agreed in askew_trials(slopes_deg, experiment.trials):
-        reason = (
-            f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
-            "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
-        )
         for name in names:
-            row = _bare_row(name, "failed", reason, experiment.trial(name))
+            row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
             failed[name] = {"row": row, "windows": [], "point": None}
     return failed
 

@@ -14,13 +14,13 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems
+from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems, remark
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.core.units import number
@@ -194,22 +194,19 @@ class WorkflowPlan:
             return [self.result(group)]
         if group.startswith("<made of"):
             return [path for part in STAGES[group[9:-1]].writes for path in self.files(part)]
-        per_trial = {"<tracks>": ".csv", "<kinematics>": ".csv", "<analysed>": ".json"}
-        if group in per_trial:
-            return [self.result(group[1:-1], f"{trial}{per_trial[group]}") for trial in trials]
-        if group == "<pictures>":
-            filmed = [trial for trial in trials if trial in self.filmed]
-            return [*self._figures("trial_", trials), *self._figures("strip_", filmed)]
+        if group == "<trials>":
+            paths, formats = list[str](), self.settings.figures.formats
+            for trial in trials:
+                paths += [f"tracks/{trial}.csv", f"kinematics/{trial}.csv", f"analysed/{trial}.json"]
+                pictures = ("trial", "strip") if trial in self.filmed else ("trial",)
+                paths += [f"figures/{kind}_{trial}.{form}" for kind in pictures for form in formats]
+            return [self.result(path) for path in paths]
         kinds = {"<experiment>": (True,), "<measurements>": (False,), "<inputs>": (True, False)}[group]
         return [path.as_posix() for path in self.inputs if _is_stated(path) in kinds]
 
     def result(self, *parts: str) -> str:
         """Path of a result."""
         return self.results.joinpath(*parts).as_posix()
-
-    def _figures(self, prefix: str, names: Iterable[str]) -> list[str]:
-        formats = self.settings.figures.formats
-        return [self.result("figures", f"{prefix}{name}.{form}") for name in names for form in formats]
 
     def settings_of(self, stage: Stage) -> str:
         """Settings that a stage depends on, as JSON; all but the paths, which have many spellings, if it names none."""
@@ -358,18 +355,11 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     if smoothing := detect_smoothing(tracks, rounding_m):
         notes.append(smoothing.note)
     if rounding_m > 0:
-        notes.append(
-            f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"
-            " export them with all measured digits."
-        )
+        notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))
 
 
 RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
-
-
-class RunError(UserError):
-    """A run that failed; the message names the stage and the reason."""
 
 
 def run_paths(folder: Path, base: Path | None) -> tuple[Path, Path]:
@@ -443,7 +433,7 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
     if process.returncode:
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
-        raise RunError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
+        raise UserError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
 
 
 # ------------------------------------------------------------------------------

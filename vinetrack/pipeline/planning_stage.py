@@ -1,49 +1,55 @@
-"""The commands about vines not yet built, `vinetrack predict` and `vinetrack design`: lines, figures, CSV and JSON."""
+"""The commands about vines not yet built and trials not yet made: `vinetrack predict`, `design` and `power`."""
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem, format_problems, remark
-from vinetrack.core.records import Trial
-from vinetrack.core.tables import write_csv
+from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
+from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Trial
+from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
+from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
+from vinetrack.diagnosis.campaign_power import fitted_tests, planned_tests, rates_of, simulated_diagnosis
+from vinetrack.diagnosis.further_trials import further_trials
+from vinetrack.diagnosis.ladder import candidates_of
+from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.misfit_tests import MisfitTests
+from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.dynamics.model import host_for
+from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.experiment.folder import REQUIRED_FOR_PREDICTION, Experiment, planned_sheet, planned_trial
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
+from vinetrack.experiment.folder import (
+    REQUIRED_FOR_PREDICTION,
+    Experiment,
+    planned_sheet,
+    planned_trial,
+    read_experiment,
+)
 from vinetrack.experiment.schema import COLUMNS, option, read_range
-from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.experiment.settings import Limits
+from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import check_figure, write_figure
-from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit import fit
+from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.effects_stage import effects_of
-from vinetrack.planning.prediction import (
-    GAMMAS,
-    TIME,
-    Choice,
-    Room,
-    VinePrediction,
-    chambers,
-    fastest,
-    final_speeds,
-    final_with,
-    gauge_loss,
-    predict_vine,
-    supplied_chamber,
-    swept_m3,
-)
+from vinetrack.pipeline.stages import map_unordered
+from vinetrack.planning import prediction as vines
+from vinetrack.planning.prediction import Choice, Room, VinePrediction
 from vinetrack.planning.predictive_inputs import (
     Band,
     FitNumbers,
@@ -53,7 +59,15 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
     read_sizes,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    measured_trials,
+    read_diagnosis,
+    read_fit,
+    read_json,
+    read_source_experiment,
+)
 
 # ------------------------------------------------------------------------------
 # Inputs of the commands: options or a sheet, a fit, effects.
@@ -111,7 +125,7 @@ def read_basis(
         with planning_errors():
             fit = FitNumbers(summary, results.as_posix())
     if sheet is None:
-        planned = planned_trial(cells, ExperimentSettings(), needed)
+        planned = planned_trial(cells, needed=needed)
     else:
         planned = planned_sheet(sheet)
         said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
@@ -119,7 +133,7 @@ def read_basis(
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
     if tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
-    user_effects = effects_of_plan(planned) if fit is None else _effects_of_fit(fit)
+    user_effects = _own_effects(planned, fit)
     read = [read_sizes(text, user_effects) for text in effects]
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
@@ -127,24 +141,11 @@ def read_basis(
     return PredictionBasis(planned, stated, fit, heading)
 
 
-def effects_of_plan(planned: Experiment) -> Mapping[str, Effect]:
-    """Return the user's own effects of the experiment to which a sheet belongs."""
-    return effects_of(planned.folder) if planned.settings.effects else {}
-
-
-def _effects_of_fit(fit: FitNumbers) -> Mapping[str, Effect]:
-    """Read the user's own effects of the experiment that was fitted, if the model contains any."""
-    own_names = [name for name in fit.fit.names if name not in catalogue()]
-    if not own_names:
-        return {}
-    experiment = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
-    user_effects = effects_of(experiment) if experiment.is_dir() else {}
-    if not set(own_names) <= set(user_effects):
-        raise ResultsError(
-            f"{fit.source} was fitted with {', '.join(own_names)}, an effect of its experiment, which is no longer "
-            f"in {experiment}: put the folder back, or fit again"
-        )
-    return user_effects
+def _own_effects(planned: Experiment, fit: FitNumbers | None = None) -> Mapping[str, Effect]:
+    """Return the user's own effects of the experiment that was fitted, else of that to which a sheet belongs."""
+    if fit is None:
+        return effects_of(planned.folder) if planned.settings.effects else {}
+    return effects_of(Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", ""))))
 
 
 @contextmanager
@@ -182,7 +183,9 @@ def predict_conditions(
     basis = read_basis(**given)
     with planning_errors():
         all_inputs = progress(basis.inputs, "predicting")
-        predictions = [predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
+        predictions = [
+            vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs
+        ]
         content = [_json_entry(prediction) for prediction in predictions]
         several = len(predictions) > 1
         lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
@@ -247,7 +250,7 @@ def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
     yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
     rows = []
     for prediction in predictions:
-        speed, time = _quantity_row(prediction.final)[1:4], _quantity_row(prediction[TIME])[2:4]
+        speed, time = _quantity_row(prediction.final)[1:4], _quantity_row(prediction[vines.TIME])[2:4]
         rows.append((prediction.inputs.trial.condition, *speed, *time, f"{prediction.slack:.0%}"))
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
@@ -309,7 +312,7 @@ def design_vine(
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
-    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",") if part.strip()]
+    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",")]
     room = Room(
         films_m=tuple(dict.fromkeys(films_m)),
         diameter_m=read_si_range("diameter_mm", diameter),
@@ -319,16 +322,12 @@ def design_vine(
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
-    max_films = 12  # Largest number of films (chosen)
-    if not 0 < len(room.films_m) <= max_films:
-        raise refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
     thickest_m = max(room.films_m)
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
         raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
-        choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    _refuse_standstill(room, choices)
+        choices = vines.fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     lines = [*basis.heading, *_vine_lines(room, choices)]
     if figure is not None:
         write_figure(draw_choice(choices), figure)
@@ -340,20 +339,6 @@ def design_vine(
         entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION} | {"final_speed_m_s": speed}
         entries.append({**entry, "fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)})
     return lines, {"warnings": basis.heading, "films": entries}
-
-
-def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
-    """Refuse a design in which no vine reaches its end at the medians of the predictive inputs."""
-    if choices[0].prediction.final.median > 0:
-        return
-    highest_Pa = max(choice.prediction.inputs.trial.pressure_Pa for choice in choices)
-    yield_kPa = choices[0].prediction.inputs.trial.yield_pressure_Pa / 1e3
-    message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
-    remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
-    if highest_Pa < 0.995 * room.pressure_Pa:
-        message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
-        remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
-    raise refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
@@ -391,14 +376,16 @@ def design_reservoir(
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
     basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
-    trial, loss, swept = basis.planned.trials[0], within_percent / 100, swept_m3(basis.planned.trials[0])
+    trial, loss, swept = basis.planned.trials[0], within_percent / 100, vines.swept_m3(basis.planned.trials[0])
     with planning_errors(), waiting("simulating"):
         inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
-        found = chambers(trial, loss)
+        found = vines.chambers(trial, loss)
         lost = {name: _losses(trial, volume_m3) for name, volume_m3 in found.items()}
         lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, found, lost, at_fraction)]
         if math.isfinite(supply_s) and inputs is not None:
-            volumes = {law: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
+            volumes = {
+                law: vines.supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in vines.GAMMAS.items()
+            }
             lines.append(str(remark("supplied_chambers", ms=1e3 * supply_s, volumes=volumes)))
     if math.isfinite(supply_s) and inputs is None:
         lines.append(f"! {remark('supply_needs_wall')}")
@@ -415,28 +402,234 @@ def design_reservoir(
 
 def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
     """Fraction of the gauge pressure that a chamber, or each of several, loses, by the gas law."""
-    return {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()}
+    return {law: vines.gauge_loss(trial, volume_m3, gamma) for law, gamma in vines.GAMMAS.items()}
 
 
 def _reservoir_lines(
     trial: Trial, inputs: PredictiveInputs | None, loss: float, found: Mapping[str, float],
     lost: Mapping[str, Mapping[str, float]], at_fraction: float,
 ) -> Iterator[str]:  # fmt: skip
-    yield str(remark("sweeps", trial=trial, swept_m3=swept_m3(trial), in_full=inputs is not None))
+    yield str(remark("sweeps", trial=trial, swept_m3=vines.swept_m3(trial), in_full=inputs is not None))
     yield str(remark("keeps_pressure", percent=100 * loss))
     yield ""
-    laws = [law.split(",")[0] for law in GAMMAS]
+    laws = [law.split(",")[0] for law in vines.GAMMAS]
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
     for name, volume_m3 in found.items():
         cells = [name, volume_text(volume_m3), *(f"{100 * share:.1f}" for share in lost[name].values())]
         if inputs is not None:
-            finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
+            finals = [vines.final_with(inputs, volume_m3, gamma, at_fraction) for gamma in vines.GAMMAS.values()]
             cells += [value_in_unit(final, "m/s") for final in finals]
         rows.append(cells)
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
     if inputs is not None:
-        (steady,) = final_speeds(inputs.model, [inputs.trial], at_fraction, host=host_for(inputs.model)).tolist()
+        (steady,) = vines.final_speeds(inputs.model, [inputs.trial], at_fraction, host=host_for(inputs.model)).tolist()
         place = 1.0 if trial.payload_kg > 0 else at_fraction
         yield str(remark("speeds_at_medians", y_over_L=place, m_s=steady))
     yield str(remark("slow_and_fast"))
+
+
+# ------------------------------------------------------------------------------
+# The command `vinetrack power`: statistical power of the trials of a sheet, an experiment or a results folder.
+
+
+@dataclass(frozen=True)
+class PowerRequest:
+    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
+    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
+    with each.
+    """
+
+    target: Path
+    effects: tuple[str, ...] = ()
+    noise_mm: float = math.nan
+    noise_correlation: float = math.nan
+    spread_P: float = math.nan
+    spread_B: float = math.nan
+    capture_fps: float = math.nan
+    systematic_mm: float = math.nan
+    B: float = math.nan
+    n: float = math.nan
+    simulate: int = 0
+    jobs: int = 1
+    first_seed: int = 1
+    reach: float = math.nan
+    experiment: Path | None = None
+
+    def scatter(
+        self, noise: Sequence[float], of_noise: str, spreads: Sequence[float], of_spreads: str
+    ) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
+        """Noise of a position, m, with its correlation, and standard deviations of pressure and B between trials: each
+        as stated, else as given here; and both in words with where they come from.
+        """
+        stated = np.array([[self.noise_mm / 1e3, self.noise_correlation], [self.spread_P, self.spread_B]])
+        (sigma_m, correlation), (of_P, of_B) = np.where(np.isnan(stated), [noise, spreads], stated).tolist()
+        origins = np.where(np.isnan(stated).all(axis=1), [of_noise, of_spreads], "stated").tolist()
+        inputs = [
+            PowerInput("noise of a position", f"{1e3 * sigma_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
+            PowerInput("spread of pressure from trial to trial", f"{100 * of_P:.2g} %", origins[1]),
+            PowerInput("spread of B from trial to trial", f"{100 * of_B:.2g} %", origins[1]),
+        ]
+        return (sigma_m, correlation), (of_P, of_B), inputs
+
+
+# Tests, what cannot be tested and why, the quantities assumed, and constraints on further trials
+Campaign = tuple[MisfitTests, Mapping[str, Remark], list[PowerInput], Limits]
+
+
+def _campaign_of_target(request: PowerRequest) -> Campaign:
+    """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
+    target, added = request.target, tuple[str, ...]()
+    experiment: Experiment | None = None
+    if (target / PROVENANCE).exists():
+        results, experiment = Results(target), read_source_experiment(target, request.experiment)
+        diagnosis = read_diagnosis(results)
+        if diagnosis is not None and diagnosis.final_verdict == ADEQUATE:
+            added = diagnosis.effects
+        pairs: Pairs = measured_trials(experiment, results)[0]
+    else:
+        with suppress(ExperimentError):  # recordings that do not exist yet: a plan
+            experiment = read_experiment(target) if target.is_dir() else None
+        if experiment is None or all(trial.track is None for trial in experiment.trials):
+            return _planned_campaign(request, planned_sheet(target, every_row=True))
+        pairs = pairs_of(experiment)[0]
+    settings = experiment.settings
+    names = dict.fromkeys((*settings.model, *added))
+    model = make_model(names, effects_of(experiment.folder))
+    return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
+
+
+def _measured_campaign(
+    request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None, limits: Limits
+) -> Campaign:
+    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
+    host = host_for(model, candidates_of(model, candidates, model.user_effects))
+    fitted = fit(model, pairs, host=host, profile=False, thorough=False)
+    noise, spreads, inputs = request.scatter(
+        (fitted.noise_m, fitted.noise_correlation), "fit", fitted.state.spread, "fit"
+    )
+    of_points = noise if inputs[0].origin == "stated" else None
+    of_trials = spreads if inputs[1].origin == "stated" else None
+    if of_points or of_trials:
+        fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
+    else:
+        inputs = []
+    return *fitted_tests(fitted, candidates), inputs, limits
+
+
+def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
+    """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
+    settings = planned.settings
+    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=_own_effects(planned))
+    of_vines = {trial.vine: trial for trial in reversed(planned.trials)}
+    by_vine = {trial.vine: predictive_inputs(of_vines[trial.vine], stated) for trial in planned.trials}
+    first = next(iter(by_vine.values()))
+    # 1e-4: noise of a position, m (chosen)
+    usual = "guess: a usual batch of vines"
+    noise, spreads, inputs = request.scatter((1e-4, 0.0), "guess", first.spreads, usual)
+    systematic_m, systematic_origin = expected_systematic_m(settings), "experiment.yaml"
+    if settings.position_systematic_mm is None:
+        systematic_origin = "lens known from a target"
+    if math.isfinite(request.systematic_mm):
+        systematic_m, systematic_origin = request.systematic_mm / 1e3, "stated"
+    elif not math.isfinite(systematic_m):
+        longest_m = max((trial.length_m for trial in planned.trials if math.isfinite(trial.length_m)), default=0.0)
+        systematic_m = SYSTEMATIC_OF_TRAVEL * longest_m
+        systematic_origin = "guess: positions by a scale, lens uncorrected"
+    trials, rates = [], []
+    for trial in planned.trials:
+        if not math.isfinite(trial.yield_pressure_Pa):
+            assumed_Pa = by_vine[trial.vine].trial.yield_pressure_Pa
+            trial = replace(trial, yield_pressure_Pa=assumed_Pa, yield_pressure_sigma_Pa=1e3 * YIELD_SIGMA_KPA)
+        trials.append(replace(trial, position_systematic_m=systematic_m))
+        known = (request.capture_fps, trial.capture_fps, 1069.0)  # the last: chosen
+        rates.append(next(filter(math.isfinite, known)))
+    is_in_sheet = all(math.isfinite(trial.capture_fps) for trial in trials)
+    fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
+    inputs += [
+        PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
+        PowerInput("frame rate", f"{rates[0]:g} /s", fps_origin),
+        *(
+            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", str(of_vine.origins[key]))
+            for vine, of_vine in by_vine.items()
+            for symbol, key in (("B", DAMPING), ("n", EXPONENT))
+        ),
+    ]
+    model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
+    return *planned_tests(model, trials, rates, spreads, noise, settings.candidates), inputs, settings.limits
+
+
+@in_one_blas_thread
+def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
+    """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
+    with waiting("calculating the power of the trials"):
+        if given is None:
+            campaign = _campaign_of_target(request)
+        elif isinstance(given, Fit):
+            campaign = (*fitted_tests(given), [], Limits())
+        else:
+            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+        tests, not_testable, inputs, limits = campaign
+        now = power_of(tests, not_testable, inputs, nonlinear=True)
+    power, asked = now, [_asked(text, now) for text in request.effects]
+    if request.simulate:
+        power = replace(power, simulated=tuple(_simulated_rates(request, tests, now, asked)))
+    if math.isfinite(request.reach):
+        for text, (name, value) in zip(request.effects, asked, strict=True):
+            if name in power.not_testable:
+                why = str(power.not_testable[name])
+                raise refusal("--effect", text, "cannot be tested with the columns of these trials", why)
+            if not math.isfinite(value):
+                raise refusal("--effect", text, "needs a size", "write the size to detect, such as leak=0.5")
+            with waiting(f"searching for trials that detect {name}"):
+                plan = further_trials(tests, power[name], value, request.reach, limits)
+            power = replace(power, further=(*power.further, plan))
+    return power.of_effects([name for name, _ in asked])
+
+
+def _asked(text: str, power: Power) -> tuple[str, float]:
+    """Read `name` or `name=size`: the effect, and its size in SI, NaN where none is given."""
+    name, _, size = text.partition("=")
+    if name in power.not_testable:
+        return name, math.nan
+    known = {entry.effect: entry.unit for entry in power.effects}
+    if name not in known:
+        candidates = sorted([*known, *power.not_testable])
+        close = difflib.get_close_matches(name, candidates, 1, 0.6)
+        remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
+        message = "is in the model already" if name in power.model else "is not a candidate for these trials"
+        raise refusal("--effect", name, message, remedy)
+    unit, factor = display_unit(known[name])
+    try:
+        return name, float(size or "nan") / factor
+    except ValueError:
+        remedy = f"write a number in {unit or 'the unit of the parameter'}"
+        raise refusal("--effect", text, "is not a size", remedy) from None
+
+
+def sheet_rows(power: Power) -> list[dict[str, object]]:
+    """Return the rows of the sheet for the further trials."""
+    return [
+        {
+            "trial": f"{plan.power.effect if len(power.further) > 1 else 'added'}_{k}",
+            **{name: value for name, value in trial.items() if name in COLUMNS},
+        }
+        for plan in power.further
+        for k, trial in enumerate(plan.trials, 1)
+    ]
+
+
+def _simulated_rates(
+    request: PowerRequest, tests: MisfitTests, power: Power, asked: Sequence[tuple[str, float]]
+) -> Iterator[SimulatedRates]:
+    """Simulate campaigns like that of the tests, diagnose each in full; yield the rate of each kind, the null first."""
+    wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
+    for entry, size in ((power[name], size) for name, size in asked if name not in power.not_testable):
+        sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
+        known = filter(math.isfinite, sizes)
+        wanted += [(entry.effect, (value, *entry.other_values), entry.probability_at(value)) for value in known]
+    seeds = range(request.first_seed, request.first_seed + request.simulate)
+    for effect, values, predicted_rate in wanted:
+        done = map_unordered(partial(simulated_diagnosis, tests, effect, values), seeds, request.jobs)
+        diagnoses = list(progress(done, f"campaigns with {effect or 'nothing missing'}", len(seeds)))
+        yield rates_of(effect, diagnoses, values[0], predicted_rate)
