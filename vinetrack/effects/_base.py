@@ -134,9 +134,6 @@ REFERENCE_TRIAL = Trial(
 )  # fmt: skip
 
 
-_CHECKED = ConfigDict(revalidate_instances="always")  # The parts of an effect are checked with it
-
-
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of an effect that can be fitted.
@@ -149,7 +146,7 @@ class Parameter:
     the sheet causes, each with a description; such a size is plausible however large it is.
     """
 
-    __pydantic_config__ = _CHECKED
+    __pydantic_config__ = ConfigDict(revalidate_instances="always")
 
     name: str
     symbol: str
@@ -185,7 +182,7 @@ class Worked:
     their defaults.
     """
 
-    __pydantic_config__ = _CHECKED
+    __pydantic_config__ = ConfigDict(revalidate_instances="always")
 
     hook: str
     expected: float

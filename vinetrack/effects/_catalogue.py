@@ -37,7 +37,7 @@ PACKAGE = Path(__file__).resolve().parents[1]  # Files below this folder are not
 POLICY = "VINETRACK_OWN_EFFECTS"  # Environment variable: if `known`, own effects that never ran here are refused
 
 
-def _trace(path: Path) -> Path:
+def _mark_of(path: Path) -> Path:
     """The file, named by the hash of an own effect's text, that is there once this text has run."""
     state = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
     return Path(state, "vinetrack", "own_effects", hashlib.sha256(path.read_bytes()).hexdigest())
@@ -46,18 +46,18 @@ def _trace(path: Path) -> Path:
 def remember(path: Path) -> None:
     """Remember an own effect as known, because it was announced or written by this program."""
     with contextlib.suppress(OSError):
-        write_text(_trace(path), str(path.resolve()))
+        write_text(_mark_of(path), str(path.resolve()))
 
 
 def announce(path: Path) -> None:
     """Announce an own effect that has not run before on standard error, and remember it."""
     path = path.resolve()
-    if path.is_relative_to(PACKAGE) or os.access(trace := _trace(path), os.F_OK):
+    if path.is_relative_to(PACKAGE) or os.access(mark := _mark_of(path), os.F_OK):
         return
     if os.environ.get(POLICY) == "known":
         remedy = "read it, then run it once without that"
-        raise EffectError(f"{path}: has never run here (sha256 {trace.name}), and {POLICY} is `known`: {remedy}.")
-    print(f"{path} (sha256 {trace.name}) runs for the first time: it is a program with your rights.", file=sys.stderr)
+        raise EffectError(f"{path}: has never run here (sha256 {mark.name}), and {POLICY} is `known`: {remedy}.")
+    print(f"{path} (sha256 {mark.name}) runs for the first time: it is a program with your rights.", file=sys.stderr)
     remember(path)
 
 
@@ -137,8 +137,13 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
         "path": path.resolve(),
         "breakpoints": breakpoints,
     }
-    effect: Effect = TypeAdapter(Effect).validate_python(given)
+    effect: Effect = _adapter().validate_python(given)
     return effect
+
+
+@lru_cache(maxsize=1)
+def _adapter() -> TypeAdapter[Effect]:
+    return TypeAdapter(Effect)
 
 
 def _faults(effect: Effect) -> Iterable[str]:

@@ -600,7 +600,8 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     # Spacings in a fourth difference may differ by 5 % of a frame.
     even[2:-2] = np.lib.stride_tricks.sliding_window_view(np.abs(spacing - 1) < 0.05, 4).all(axis=1)
     around_m = local_noise(distance_m)
-    use = even & (fit.share >= LEAST_SHARE) & (around_m > 0)
+    # 1e-12: part of the travel below which differences are the rounding of a float (derived)
+    use = even & (fit.share >= LEAST_SHARE) & (around_m > 1e-12 * np.ptp(position_m))
     # They are winsorised to 4 standard deviations of their surroundings.
     winsorised_m = np.minimum(distance_m, 4.0 * around_m)
     # The slope in one window is unreliable at a corner: the median of five is taken.
@@ -609,18 +610,20 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
 
 
 def _by_speed(differences: Sequence[_Differences]) -> tuple[float, NoiseShape] | None:
-    """−2 ln L of noise with the most likely τ of all trials together and s of each, and the standard deviations. Both
-    maximise it by the updates of `_whittle`.
+    """−2 ln L of noise with the most likely τ of all trials together and s of each, and the standard deviations, by
+    the multiplicative updates of `_whittle`.
     """
     trial = np.repeat(np.arange(len(differences)), [np.count_nonzero(part.use) for part in differences])
     square = np.concatenate([part.distance_m[part.use] for part in differences]) ** 2
     speed_square = np.concatenate([part.speed_m_s[part.use] for part in differences]) ** 2
-    if not (speed_square.any() and square.any()):
+    if not speed_square.any():
         return None
-    still, blur = np.bincount(trial, square) / np.bincount(trial), float(np.sum(square) / np.sum(speed_square))
+    typical = np.bincount(trial, square) / np.bincount(trial)
+    still, blur = typical, float(np.sum(square) / np.sum(speed_square))
     for _ in range(300):
         variance = still[trial] + blur * speed_square
         still = still * np.sqrt(np.bincount(trial, square / variance**2) / np.bincount(trial, 1 / variance))
+        still = np.maximum(still, typical / 30**2)  # a few points rounded to one value are no sign of none (chosen)
         blur *= math.sqrt(float(speed_square @ (square / variance**2)) / float(speed_square @ (1 / variance)))
     variance = still[trial] + blur * speed_square
     sd_m = tuple(np.sqrt(part_s + blur * part.speed_m_s**2) for part_s, part in zip(still, differences, strict=True))
