@@ -11,7 +11,7 @@ first_chamber       pressure of the chamber at release, of (trial) alone
 has_chamber         whether an effect gives the chamber an equation of its own, of no argument
 row_delay           how much later rows are read by the metre, s/m, of (trial) alone
 averaged_over       square of the time that positions are averaged over, s², of (trial) alone
-ask                 another quantity, and the rate of the chamber, of (what, time, y, ẏ, x, v, chamber, trial)
+ask                 what `Asked` lists, and the rate of the chamber, of (what, time, y, ẏ, x, v, chamber, trial)
 
 A model takes long to compile, so that it stands in the compiled code twice: in the steps, where a call would cost half
 as much again, and in `ask`.
@@ -22,6 +22,7 @@ The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a 
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,11 +71,17 @@ class BatchArrays(NamedTuple):
 RUNNING, ENDED, STALLED, TOO_HARD, TAUT = np.arange(5)  # Status of a trajectory
 
 
-# What can be asked of a model: the acceleration of the tail, m/s²; that of a vine at rest, including the forces that
-# hold it; the tension that its tip leaves for the tail, N, moving and at rest; the acceleration of a slack tail, m/s²;
-# the position that the camera reports, m. Numba compiles a function anew for every integer of Python's that it is
-# called with, but only once for all of numpy's.
-ACCELERATION, REST_ACCELERATION, TENSION, REST_TENSION, FREE_FALL, SEEN = np.arange(6)
+class Asked(IntEnum):
+    """What `ask` is asked. Numba compiles a function for every integer that it is called with, but for all members of
+    an enumeration once.
+    """
+
+    ACCELERATION = 0  #: of the tail, m/s²
+    REST_ACCELERATION = 1  #: of the tail of a vine at rest, including the forces that hold it, m/s²
+    TENSION = 2  #: that the tip leaves for the tail, N
+    REST_TENSION = 3  #: the same of a vine at rest
+    FREE_FALL = 4  #: acceleration of a slack tail, m/s²
+    SEEN = 5  #: position that the camera reports, m
 
 
 class Point(NamedTuple):

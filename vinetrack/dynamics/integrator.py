@@ -17,17 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from vinetrack.dynamics.equations import (
-    ACCELERATION,
     ENDED,
-    FREE_FALL,
     NO_STAGES,
-    REST_ACCELERATION,
-    REST_TENSION,
     RUNNING,
     STALLED,
     TAUT,
-    TENSION,
     TOO_HARD,
+    Asked,
     Point,
     TrialArrays,
     average_over,
@@ -73,12 +69,12 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 return status, end_time, end_speed, n_steps, slack_time
             phase = at_rest if point.v <= 0 else moving
             time, x, v, _acceleration, chamber = point
-            acceleration, _rate = _rates(equations, time, x, v, chamber, trial)
+            acceleration, _rate = _ask(equations, Asked.ACCELERATION, time, x, v, chamber, trial)
             point, previous_stages = Point(time, x, v, acceleration, chamber), NO_STAGES
             speed_scale = max(speed_scale, v)
             h = 1e-2 * max(v, 1e-3 * speed_scale) / max(abs(acceleration), 1e-9)
         if phase == at_rest:
-            if _rest_acceleration(equations, point.time, point.x, point.chamber, trial) <= 0:
+            if _ask(equations, Asked.REST_ACCELERATION, point.time, point.x, 0.0, point.chamber, trial)[0] <= 0:
                 start, chamber = _wait_for_drive(equations, trial, point, last_time)
                 resting = Point(point.time, point.x, 0.0, 0.0, chamber)
                 row = _write_at_rest(equations, trial, times, row, start, resting, out)
@@ -178,18 +174,10 @@ def integrate_trials(equations, batch, first, last, rtol, out, ends, work, means
 
 
 @inlined
-def _rates(equations, time, x, v, chamber, trial):
-    """`equations.rates` for callers outside the steps."""
+def _ask(equations, what, time, x, v, chamber, trial):
+    """What `Asked` lists, and the rate of the chamber, where the tail is taut: x = r·y."""
     r, x, v = trial.inputs[RATIO], max(x, 0.0), max(v, 0.0)
-    return equations.ask(ACCELERATION, time, x / r, v / r, x, v, chamber, trial)
-
-
-@inlined
-def _rest_acceleration(equations, time, x, chamber, trial):
-    """Acceleration of the tail of a vine at rest, m/s², including the forces that hold it."""
-    x = max(x, 0.0)
-    acceleration, _rate = equations.ask(REST_ACCELERATION, time, x / trial.inputs[RATIO], 0.0, x, 0.0, chamber, trial)
-    return acceleration
+    return equations.ask(what, time, x / r, v / r, x, v, chamber, trial)
 
 
 @inlined
@@ -281,7 +269,7 @@ def _next_step_size(h, full_h, error):
 @inlined
 def _start_from_rest(equations, trial, point, until, stop):
     """Start of a motion: the point with its acceleration, the speed to be expected, and the first step size."""
-    acceleration, _rate = _rates(equations, point.time, point.x, 0.0, point.chamber, trial)
+    acceleration, _rate = _ask(equations, Asked.ACCELERATION, point.time, point.x, 0.0, point.chamber, trial)
     travel = min(stop - point.x, 0.5 * acceleration * (until - point.time) ** 2 + 1e-9)
     scale = _typical_speed(equations, trial, point.time, point.x, point.chamber, acceleration, travel)
     return Point(point.time, point.x, 0.0, acceleration, point.chamber), scale, 1e-4 * scale / acceleration
@@ -293,7 +281,7 @@ def _typical_speed(equations, trial, time, x, chamber, start_acceleration, trave
     ballistic = (2 * start_acceleration * travel) ** 0.5
     speed = ballistic
     for _ in range(60):
-        acceleration, _rate = _rates(equations, time, x, speed, chamber, trial)
+        acceleration, _rate = _ask(equations, Asked.ACCELERATION, time, x, speed, chamber, trial)
         if acceleration > 0:
             return min(2 * speed, ballistic)
         speed *= 0.5
@@ -303,11 +291,11 @@ def _typical_speed(equations, trial, time, x, chamber, start_acceleration, trave
 @compiled
 def _chamber_after(equations, trial, time, x, chamber, step):
     """Chamber pressure of a vine at rest after `step`; exact if the supply is proportional to the pressure deficit."""
-    _a, rate = _rates(equations, time, x, 0.0, chamber, trial)
+    _a, rate = _ask(equations, Asked.ACCELERATION, time, x, 0.0, chamber, trial)
     if rate == 0:
         return chamber
     delta = 1e-6 * (abs(chamber) + 1e3)
-    _a, higher = _rates(equations, time, x, 0.0, chamber + delta, trial)
+    _a, higher = _ask(equations, Asked.ACCELERATION, time, x, 0.0, chamber + delta, trial)
     decay = step * (higher - rate) / delta
     return chamber + step * rate * (np.expm1(decay) / decay if abs(decay) > 1e-12 else 1.0)
 
@@ -322,12 +310,12 @@ def _wait_for_drive(equations, trial, point, until):
     step = (until - time) / steps
     for _step in range(steps):
         after = _chamber_after(equations, trial, time, x, chamber, step)
-        if _rest_acceleration(equations, time + step, x, after, trial) > 0:
+        if _ask(equations, Asked.REST_ACCELERATION, time + step, x, 0.0, after, trial)[0] > 0:
             low, high = 0.0, step
             for _ in range(24):
                 middle = 0.5 * (low + high)
                 pressure = _chamber_after(equations, trial, time, x, chamber, middle)
-                if _rest_acceleration(equations, time + middle, x, pressure, trial) > 0:
+                if _ask(equations, Asked.REST_ACCELERATION, time + middle, x, 0.0, pressure, trial)[0] > 0:
                     high = middle
                 else:
                     low = middle
@@ -347,9 +335,9 @@ def _resolvable_start(equations, trial, time, until, x, chamber, delay):
     start, pressure = time, chamber
     while time + delay < until:
         after = _chamber_after(equations, trial, time, x, chamber, delay)
-        if _rest_acceleration(equations, time + delay, x, after, trial) <= 0:
+        if _ask(equations, Asked.REST_ACCELERATION, time + delay, x, 0.0, after, trial)[0] <= 0:
             break
-        acceleration, _rate = _rates(equations, time + delay, x, 0.0, after, trial)
+        acceleration, _rate = _ask(equations, Asked.ACCELERATION, time + delay, x, 0.0, after, trial)
         travel = 0.5 * acceleration * delay**2
         speed = _typical_speed(equations, trial, time + delay, x, after, acceleration, travel)
         if delay * speed > 1e-9 * (x + 1e-3):
@@ -387,9 +375,6 @@ DENSE_WEIGHTS = (
 )  # fmt: skip
 
 
-_X, _V, _Y, _CHAMBER = np.arange(4)  # Places in a row of rates
-
-
 class SlackState(NamedTuple):
     """State with a slack tail: position and speed of the tail, position of the tip, chamber pressure, SI."""
 
@@ -399,24 +384,17 @@ class SlackState(NamedTuple):
     chamber: float
 
 
-@inlined
-def _tip_tension(equations, what, time, x, v, chamber, trial):
-    """The tension that the tip leaves for the tail, N, moving or at rest, and the rate of the chamber."""
-    r, x, v = trial.inputs[RATIO], max(x, 0.0), max(v, 0.0)
-    return equations.ask(what, time, x / r, v / r, x, v, chamber, trial)
-
-
 @compiled
 def _slack_at_rest(equations, trial, time, x, chamber):
     """Whether the tail of a vine at rest would be under compression."""
-    tension, _rate = _tip_tension(equations, REST_TENSION, time, x, 0.0, chamber, trial)
+    tension, _rate = _ask(equations, Asked.REST_TENSION, time, x, 0.0, chamber, trial)
     return tension < 0
 
 
 @compiled
 def _slack_fraction(equations, trial, h, start, end):
     """Fraction of a step at which the tail's tension falls to zero, by bisection."""
-    tension, _rate = _tip_tension(equations, TENSION, end.time, end.x, end.v, end.chamber, trial)
+    tension, _rate = _ask(equations, Asked.TENSION, end.time, end.x, end.v, end.chamber, trial)
     if tension >= 0:
         return 2.0
     low, high = 0.0, 1.0
@@ -424,7 +402,7 @@ def _slack_fraction(equations, trial, h, start, end):
         middle = 0.5 * (low + high)
         x, v, _a = quintic(middle, h, start, end)
         pressure = start.chamber + middle * (end.chamber - start.chamber)
-        tension, _rate = _tip_tension(equations, TENSION, start.time + middle * h, x, v, pressure, trial)
+        tension, _rate = _ask(equations, Asked.TENSION, start.time + middle * h, x, v, pressure, trial)
         if tension < 0:
             high = middle
         else:
@@ -435,20 +413,20 @@ def _slack_fraction(equations, trial, h, start, end):
 @compiled
 def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
     """Tail speed r·ẏ at a tip without tension, at which its forces balance, by the Illinois method; x = r·y."""
-    f_low, _r = _tip_tension(equations, TENSION if moving else REST_TENSION, time, x, 0.0, chamber, trial)
+    f_low, _r = _ask(equations, Asked.TENSION if moving else Asked.REST_TENSION, time, x, 0.0, chamber, trial)
     if f_low <= 0:
         return 0.0
     low, high = 0.0, max(guess, 1e-6)
-    f_high, _r = _tip_tension(equations, TENSION, time, x, high, chamber, trial)
+    f_high, _r = _ask(equations, Asked.TENSION, time, x, high, chamber, trial)
     factor = 1.01
     while f_high > 0 and high < 1e6:
         low, f_low = high, f_high
         high *= factor
         factor = min(factor * factor, 10.0)
-        f_high, _r = _tip_tension(equations, TENSION, time, x, high, chamber, trial)
+        f_high, _r = _ask(equations, Asked.TENSION, time, x, high, chamber, trial)
     if low == 0.0 and guess > 0:
         near = 0.99 * guess
-        f_near, _r = _tip_tension(equations, TENSION, time, x, near, chamber, trial)
+        f_near, _r = _ask(equations, Asked.TENSION, time, x, near, chamber, trial)
         if f_near > 0:
             low, f_low = near, f_near
         else:
@@ -459,7 +437,7 @@ def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
         middle = high - f_high * (high - low) / (f_high - f_low)
         if not low < middle < high:
             middle = 0.5 * (low + high)
-        f, _r = _tip_tension(equations, TENSION, time, x, middle, chamber, trial)
+        f, _r = _ask(equations, Asked.TENSION, time, x, middle, chamber, trial)
         if f * f_high < 0:
             low, f_low = high, f_high
         else:
@@ -475,8 +453,8 @@ def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
     """Write the rates of a `SlackState` into `rates`, shape (4,); return the tail speed of the film at the tip, m/s."""
     r = trial.inputs[RATIO]
     u = _free_tip_speed(equations, trial, time, r * s.y, s.chamber, tip_speed, moving)
-    _tension, chamber_rate = _tip_tension(equations, TENSION, time, r * s.y, u, s.chamber, trial)
-    fall, _rate = equations.ask(FREE_FALL, time, s.y, u / r, s.x, s.v, s.chamber, trial)
+    _tension, chamber_rate = _ask(equations, Asked.TENSION, time, r * s.y, u, s.chamber, trial)
+    fall, _rate = equations.ask(Asked.FREE_FALL, time, s.y, u / r, s.x, s.v, s.chamber, trial)
     rates[0] = s.v
     rates[1] = 0.0 if s.v <= 0 and fall < 0 else fall
     rates[2] = u / r
@@ -516,22 +494,22 @@ def _dormand_prince(equations, trial, time, s, h, tip_speed, k):
 def _slack_at(part, h, s, end, k):
     """The state at the fraction `part` of a step."""
     return SlackState(
-        _dense(part, h, s.x, end.x, k, _X),
-        _dense(part, h, s.v, end.v, k, _V),
-        _dense(part, h, s.y, end.y, k, _Y),
-        _dense(part, h, s.chamber, end.chamber, k, _CHAMBER),
+        _dense(part, h, s.x, end.x, k[:, 0]),
+        _dense(part, h, s.v, end.v, k[:, 1]),
+        _dense(part, h, s.y, end.y, k[:, 2]),
+        _dense(part, h, s.chamber, end.chamber, k[:, 3]),
     )
 
 
 @compiled
-def _dense(part, h, start, end, k, column):
+def _dense(part, h, start, end, rates):
     """The continuous extension of one component, of order 4."""
     change = end - start
-    bend = h * k[0, column] - change
+    bend = h * rates[0] - change
     last = 0.0
     for i in range(7):
-        last += h * DENSE_WEIGHTS[i] * k[i, column]
-    remainder = change - h * k[6, column] - bend
+        last += h * DENSE_WEIGHTS[i] * rates[i]
+    remainder = change - h * rates[6] - bend
     return start + part * (change + (1 - part) * (bend + part * (remainder + (1 - part) * last)))
 
 

@@ -122,24 +122,24 @@ def {name}({arguments}):
     gauge, held = calls("gauge", "pressure ="), calls("rest_force", "tip +=", 8) or "pass"
     seen = f"""tension = max(tip, 0.0) / rig.travel_ratio
         {calls("observed_position", "seen =", 8)}"""
-    asked = f"""if what == SEEN:
+    asked = f"""if what == Asked.SEEN:
         {seen}
         return seen, 0.0
-    if what == REST_ACCELERATION or what == REST_TENSION:
+    if what == Asked.REST_ACCELERATION or what == Asked.REST_TENSION:
         {held}
     {chamber}
-    if what == FREE_FALL:
+    if what == Asked.FREE_FALL:
         return tail / mass, chamber_rate
-    if what == TENSION or what == REST_TENSION:
+    if what == Asked.TENSION or what == Asked.REST_TENSION:
         return tip / rig.travel_ratio, chamber_rate
-    if what == REST_ACCELERATION and rig.tail_free > 0:
+    if what == Asked.REST_ACCELERATION and rig.tail_free > 0:
         tip = max(tip, 0.0)
     {added}
     {acceleration}"""
     # Without an effect that changes the position that the camera reports, it is that of the edge.
     acting = " or ".join(f"on[{i}]" for i in sorted(i for i, _, _ in model.hooks["observed_position"]))
     seen = f"""if {acting or "False"}:
-        seen, chamber_rate = ask(SEEN, time, y, ydot, x, v, chamber, trial)
+        seen, chamber_rate = ask(Asked.SEEN, time, y, ydot, x, v, chamber, trial)
     return seen"""
     functions = [
         function("rates", "time, x, v, chamber, trial", moving, terms, chamber, added, acceleration),
@@ -158,8 +158,7 @@ import sys
 
 from numba import njit
 
-from vinetrack.dynamics.equations import FREE_FALL, REST_ACCELERATION, REST_TENSION, SEEN, TENSION
-from vinetrack.dynamics.equations import angle_passed, compiled, inlined, trace_at
+from vinetrack.dynamics.equations import Asked, angle_passed, compiled, inlined, trace_at
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.effects import State, TrialInputs
 
