@@ -31,6 +31,7 @@ from vinetrack.video.strip import SLOW_PX
 Grey = NDArray[np.uint8]
 
 FEWEST_CORNERS = 8  # Fewest corners of a calibration (chosen)
+LEAST_IN_PLACE = 0.8  # Least share of the markers that must lie where a board has them (chosen)
 # Distance, in squares, from where the board has it beyond which a marker belongs to another board (chosen)
 MARKER_OUTLIER = 0.3
 DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of each marker size (defined)
@@ -54,35 +55,15 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     """
     import cv2
 
-    grey = eight_bits(picture)
-    dictionary = _dictionary(board.dictionary)
+    grey, dictionary = eight_bits(picture), _dictionary(board.dictionary)
     corners, ids = _detect_markers(grey, dictionary)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
         corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
-    if not len(ids):
-        others = [name for name in OTHER_DICTIONARIES if name not in board.dictionary]
-        there = [(name, _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()) for name in others]
-        name, numbers = max(there, key=lambda markers: len(markers[1]))
-        what = f"no marker of {board.dictionary} is seen"
-        if len(numbers) >= 3:
-            likely = _smallest(name, int(numbers.max()) + 1)
-            raise CornersError(f"{what}, but {len(numbers)} of {likely}; correct `dictionary`")
-        raise CornersError(
-            f"{what}; check `dictionary`, and that the board is in the picture, in focus, not mirrored and larger than "
-            "5 pixels a marker bit"
-        )
-    share, marker_mm, layout = _best_layout(corners, ids, board, dictionary)
-    if share < 0.8:
-        raise CornersError(
-            f"the markers do not lie as on a board of {board.squares[0]} × {board.squares[1]} squares "
-            f"({len(ids)} markers, {share:.0%} in place); count the squares across and down and correct `squares`"
-        )
+    share, marker_mm, layout = _best_layout(corners, ids, board, dictionary) if len(ids) else (0.0, math.nan, None)
     # 0.10: relative difference above which markers were printed at another size (chosen)
-    if abs(marker_mm / board.marker_mm - 1) > 0.10:
-        raise CornersError(
-            f"the markers measure {marker_mm:.3g} mm beside squares of {board.square_mm:g} mm, not "
-            f"{board.marker_mm:g}; measure both on the print and correct `square_mm` or `marker_mm`"
-        )
+    if layout is None or share < LEAST_IN_PLACE or abs(marker_mm / board.marker_mm - 1) > 0.10:
+        seen = f"{len(ids)} markers of {board.dictionary} are seen"
+        raise _not_as_stated(picture, f"{seen}, {share:.0%} of them where the board has them, {marker_mm:.3g} mm wide")
     found_px, found_ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(
         grey, markerCorners=list(corners), markerIds=ids
     )
@@ -110,15 +91,20 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
             found_px = _in_original(found_px.reshape(-1, 2), enlarge)
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
             return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
-    what = f"no checkerboard of {across} × {down} squares is seen"
-    if (squares := checkerboard_squares(grey)) is not None:
-        raise CornersError(
-            f"{what}, but {squares[0]} × {squares[1]} squares are; correct `squares` (squares, not inner corners), or "
-            "show the whole board"
+    raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
+
+
+def _not_as_stated(picture: NDArray[Any], found: str) -> CornersError:
+    """The error of a picture that does not show the board of the settings: what was found, and what it shows."""
+    seen = find_board(picture)
+    if seen is None:
+        return CornersError(
+            f"{found}; the board with a white border must be in the picture, in focus, evenly lit, not mirrored and "
+            "larger than 5 pixels a marker bit, and `squares` counts squares, not inner corners"
         )
-    raise CornersError(
-        f"{what}; the whole board with a white border must be in the picture, in focus and evenly lit, and `squares` "
-        "counts squares, not inner corners"
+    markers = f" with markers of {seen.dictionary}, {seen.marker_share:.2g} of a square wide" if seen.dictionary else ""
+    return CornersError(
+        f"{found}, but a {seen.kind} of {seen.squares[0]} × {seen.squares[1]} squares{markers}; correct `calibration`"
     )
 
 
@@ -263,8 +249,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
             best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
-    # 0.8: least share of the markers that must lie where a board has them (chosen)
-    if best_share >= 0.8:
+    if best_share >= LEAST_IN_PLACE:
         return best_board
     squares = checkerboard_squares(grey)
     return None if squares is None else BoardSeen("checkerboard", squares)
