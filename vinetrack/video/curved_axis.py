@@ -96,9 +96,8 @@ def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
 def find_curve(small: SmallPictures, band: Band | None = None) -> Axis | None:
     """Find the smoothed middle of the band that changed, from its first change to its last."""
     band = band or _changed_band(small)
-    path = None if band is None else _centreline(band)
     # 3.0: least length of the band, in its widths, that has a path (chosen)
-    if band is None or path is None or len(path) < 3.0 * band.width:
+    if band is None or len(path := _centreline(band)) < 3.0 * band.width:
         return None
     # Turned round where its pixels changed from its end to its beginning
     times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
@@ -160,13 +159,11 @@ def _changed_band(small: SmallPictures) -> Band | None:
     return Band(region, depth, when, 2 * half + 1)
 
 
-def _centreline(band: Band) -> Floats | None:
+def _centreline(band: Band) -> Floats:
     """Pixels (x, y) of the cheapest path along the middle of a band between its two most distant ends, shape (n, 2)."""
     from skimage.graph import MCP_Geometric
 
     rows, columns = np.nonzero(band.region)
-    if not rows.size:
-        return None
     blocked = np.full(band.region.shape, -1.0)
     unit_costs = np.where(band.region, 1.0, blocked)
     start = end = int(rows[0]), int(columns[0])
