@@ -318,10 +318,12 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[n
     group_size = int(np.clip(len(first) // 12, 1, 4))
     grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
     power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
-    exact = np.zeros_like(first)
-    # 4.0: change of a pixel, in units of the noise, that counts as one standard deviation (chosen)
-    path = _path_by_appearance(strip, np.stack([last, first, exact, exact]), 4.0 * strip.noise, (0, len(power)))
-    path, passed = _trim_to_changed_runs(path, power)
+    # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
+    # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
+    weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
+    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
+    votes = [((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks]
+    path, passed = _trim_to_changed_runs(ky.dividing_path(np.stack(votes)), power)
     return path, passed, initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2]
 
 
