@@ -11,7 +11,7 @@ from plain_scene import write_video
 from vinetrack.experiment.settings import Charuco, Checkerboard, TwoPoints
 from vinetrack.laboratory.filming import render_target
 from vinetrack.laboratory.scene import Camera, Target, preset
-from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures, find_board, fit_planes
+from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures, find_board, fit_plane
 
 DEMO = preset("demo")
 CAMERA = Camera(m_per_px=1 / 2400, focal_px=1500, k1=-0.2, k2=0.05, tilt_x_deg=4, tilt_y_deg=-7)
@@ -71,7 +71,7 @@ def test_stated_errors_of_many_fits_are_neither_too_small_nor_too_large():
     exact = CAMERA.picture_from_plane(board_m / CAMERA.m_per_px + np.array(CAMERA.centre_px))
     z = []
     for _ in range(100):
-        (plane,), _ = fit_planes([(exact + rng.normal(0, 0.05, exact.shape), board_m)], 960, 320)
+        plane, _ = fit_plane(exact + rng.normal(0, 0.05, exact.shape), board_m, 960, 320)
         found_m = np.linalg.norm(np.diff(plane.plane_m(np.array(AXIS)), axis=0))
         z.append((found_m / true_length_m(CAMERA, AXIS) - 1) / plane.path_rel_sigma(np.array(AXIS)))
     assert np.std(z) == pytest.approx(1.0, abs=0.15)
@@ -84,7 +84,7 @@ def test_plane_map_agrees_with_opencv_on_a_lens_and_a_pose_of_its_own():
     lens, turn, away = np.array([-0.22, 0.06, 0, 0, 0]), np.array([0.12, -0.15, 0.03]), np.array([-0.2, -0.1, 0.75])
     grid = np.stack(np.meshgrid(np.arange(14), np.arange(8)), axis=-1).reshape(-1, 2) * 0.03
     seen, _ = cv2.projectPoints(np.column_stack([grid, np.zeros(len(grid))]), turn, away, matrix, lens)
-    (plane,), reprojection_px = fit_planes([(seen[:, 0], grid)], 1280, 720)
+    plane, reprojection_px = fit_plane(seen[:, 0], grid, 1280, 720)
     assert reprojection_px < 1e-3
     between = grid[:-15] + 0.013
     truth, _ = cv2.projectPoints(np.column_stack([between, np.zeros(len(between))]), turn, away, matrix, lens)
@@ -133,7 +133,7 @@ def test_a_small_target_states_a_larger_error():
 
 
 @pytest.mark.slow
-def test_moved_target_shows_the_plane_first_and_the_lens_throughout(tmp_path):
+def test_of_a_moved_target_the_first_picture_shows_the_plane(tmp_path):
     moved = [picture(seed=2002)]
     for k, (x_m, tilt_deg) in enumerate(((0.03, 5), (-0.04, -10), (0.06, 3))):
         moved.append(picture(replace(BOARD, centre_m=(x_m, 0.0)), replace(CAMERA, tilt_y_deg=tilt_deg), seed=2003 + k))

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
+from vinetrack.core.records import Floats, Indices, Kinematics, Track
 from vinetrack.core.threads import njit
 from vinetrack.tracks.position_noise import position_noise
 
@@ -28,16 +28,15 @@ from vinetrack.tracks.position_noise import position_noise
 @dataclass(frozen=True)
 class WindowFits:
     """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
-    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,).
+    `coefficients` (order + 1, m), their `covariance` (order + 1, order + 1, m) for noise of 1 m; `middle_s`, `half_s`
+    (m,).
     """
 
     width: int
     coefficients: Floats
     middle_s: Floats
     half_s: Floats
-    even_covariance: Floats
-    odd: Bools
-    odd_covariance: Floats | None
+    covariance: Floats
     misfit: Floats
     misfit_terms: int
 
@@ -55,10 +54,7 @@ class WindowFits:
         curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
         c = self.coefficients[:, window]
         values = np.array([(c * value).sum(axis=0), (c * slope).sum(axis=0) / half, (c * curve).sum(axis=0) / half**2])
-        variance = np.einsum("ik,ij,jk->k", slope, self.even_covariance, slope)
-        if self.odd_covariance is not None:
-            variance_there = np.einsum("ik,ijk,jk->k", slope, self.odd_covariance[:, :, window], slope)
-            variance = np.where(self.odd[window], variance_there, variance)
+        variance = np.einsum("ik,ijk,jk->k", slope, self.covariance[:, :, window], slope)
         return values, np.sqrt(np.maximum(variance, 0.0)) / half
 
     def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
@@ -76,22 +72,21 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
-    weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    weights, even_covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    covariance = np.repeat(even_covariance[0][:, :, None], m, axis=2)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
     # Odd windows contain a spacing different from the median, by more than 1 % (chosen).
     spacing = np.diff(time_s)
     uneven = np.concatenate([[0], np.cumsum(np.abs(spacing / np.median(spacing) - 1) > 0.01)])
     odd = uneven[width - 1 :] > uneven[: uneven.size - width + 1]
-    odd_covariance = None
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
         u = (time_s[take] - middle[odd, None]) / half[odd, None]
         uneven_weights, uneven_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
         results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
-        odd_covariance = np.zeros((order + 1, order + 1, m))
-        odd_covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
+        covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
-    return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
+    return WindowFits(width, results[: order + 1], middle, half, covariance, misfit, terms)
 
 
 def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:

@@ -31,6 +31,7 @@ from vinetrack.video.strip import SLOW_PX
 Grey = NDArray[np.uint8]
 
 FEWEST_CORNERS = 8  # Fewest corners of a calibration (chosen)
+LEAST_IN_PLACE = 0.8  # Least share of the markers that must lie where a board has them (chosen)
 # Distance, in squares, from where the board has it beyond which a marker belongs to another board (chosen)
 MARKER_OUTLIER = 0.3
 DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of each marker size (defined)
@@ -54,35 +55,15 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     """
     import cv2
 
-    grey = eight_bits(picture)
-    dictionary = _dictionary(board.dictionary)
+    grey, dictionary = eight_bits(picture), _dictionary(board.dictionary)
     corners, ids = _detect_markers(grey, dictionary)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
         corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
-    if not len(ids):
-        others = [name for name in OTHER_DICTIONARIES if name not in board.dictionary]
-        there = [(name, _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()) for name in others]
-        name, numbers = max(there, key=lambda markers: len(markers[1]))
-        what = f"no marker of {board.dictionary} is seen"
-        if len(numbers) >= 3:
-            likely = _smallest(name, int(numbers.max()) + 1)
-            raise CornersError(f"{what}, but {len(numbers)} of {likely}; correct `dictionary`")
-        raise CornersError(
-            f"{what}; check `dictionary`, and that the board is in the picture, in focus, not mirrored and larger than "
-            "5 pixels a marker bit"
-        )
-    share, marker_mm, layout = _best_layout(corners, ids, board, dictionary)
-    if share < 0.8:
-        raise CornersError(
-            f"the markers do not lie as on a board of {board.squares[0]} × {board.squares[1]} squares "
-            f"({len(ids)} markers, {share:.0%} in place); count the squares across and down and correct `squares`"
-        )
+    share, marker_mm, layout = _best_layout(corners, ids, board, dictionary) if len(ids) else (0.0, math.nan, None)
     # 0.10: relative difference above which markers were printed at another size (chosen)
-    if abs(marker_mm / board.marker_mm - 1) > 0.10:
-        raise CornersError(
-            f"the markers measure {marker_mm:.3g} mm beside squares of {board.square_mm:g} mm, not "
-            f"{board.marker_mm:g}; measure both on the print and correct `square_mm` or `marker_mm`"
-        )
+    if layout is None or share < LEAST_IN_PLACE or abs(marker_mm / board.marker_mm - 1) > 0.10:
+        seen = f"{len(ids)} markers of {board.dictionary} are seen"
+        raise _not_as_stated(picture, f"{seen}, {share:.0%} of them where the board has them, {marker_mm:.3g} mm wide")
     found_px, found_ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(
         grey, markerCorners=list(corners), markerIds=ids
     )
@@ -110,15 +91,20 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
             found_px = _in_original(found_px.reshape(-1, 2), enlarge)
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
             return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
-    what = f"no checkerboard of {across} × {down} squares is seen"
-    if (squares := checkerboard_squares(grey)) is not None:
-        raise CornersError(
-            f"{what}, but {squares[0]} × {squares[1]} squares are; correct `squares` (squares, not inner corners), or "
-            "show the whole board"
+    raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
+
+
+def _not_as_stated(picture: NDArray[Any], found: str) -> CornersError:
+    """The error of a picture that does not show the board of the settings: what was found, and what it shows."""
+    seen = find_board(picture)
+    if seen is None:
+        return CornersError(
+            f"{found}; the board with a white border must be in the picture, in focus, evenly lit, not mirrored and "
+            "larger than 5 pixels a marker bit, and `squares` counts squares, not inner corners"
         )
-    raise CornersError(
-        f"{what}; the whole board with a white border must be in the picture, in focus and evenly lit, and `squares` "
-        "counts squares, not inner corners"
+    markers = f" with markers of {seen.dictionary}, {seen.marker_share:.2g} of a square wide" if seen.dictionary else ""
+    return CornersError(
+        f"{found}, but a {seen.kind} of {seen.squares[0]} × {seen.squares[1]} squares{markers}; correct `calibration`"
     )
 
 
@@ -263,8 +249,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
             best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
-    # 0.8: least share of the markers that must lie where a board has them (chosen)
-    if best_share >= 0.8:
+    if best_share >= LEAST_IN_PLACE:
         return best_board
     squares = checkerboard_squares(grey)
     return None if squares is None else BoardSeen("checkerboard", squares)
@@ -354,45 +339,35 @@ def _half_diagonal_px(width_px: int, height_px: int) -> float:
     return 0.5 * float(np.hypot(width_px, height_px))
 
 
-def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px: int) -> tuple[list[PlaneMap], float]:
-    """Fit a plane to each view and a common lens; also return the root mean square reprojection error, px. Shapes:
-    views (n, 2).
+def fit_plane(corners_px: Floats, board_m: Floats, width_px: int, height_px: int) -> tuple[PlaneMap, float]:
+    """Fit plane and lens to the corners of a board; also return the root mean square reprojection error, px. Shapes:
+    corners_px, board_m (n, 2).
     """
     import cv2
     from scipy.optimize import least_squares
 
-    size = (width_px, height_px)
-    corners = [_half_diagonals(picture, size) for picture, _ in views]
-    reach_m = max(float(np.ptp(board, axis=0).max()) for _, board in views)
-    places = [board / reach_m for _, board in views]
-    start = [cv2.findHomography(corner, place)[0].ravel()[:8] for corner, place in zip(corners, places, strict=True)]
-    values = np.concatenate([*start, np.zeros(N_LENS)])
-    unit_px = _half_diagonal_px(*size)
+    corners = _half_diagonals(corners_px, (width_px, height_px))
+    reach_m = float(np.ptp(board_m, axis=0).max())
+    places = board_m / reach_m
+    values = np.append(cv2.findHomography(corners, places)[0].ravel()[:8], np.zeros(N_LENS))
+    unit_px = _half_diagonal_px(width_px, height_px)
     noise_px = 0.1
 
     def misfit(values: Floats) -> Floats:
         """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
-        fits = np.concatenate([view.ravel() for view in _residuals(values, corners, places)]) / (noise_px / unit_px)
-        tilts = values[: len(views) * N_PLANE].reshape(-1, N_PLANE)[:, 6:] / PRIOR_SIGMA[:2]
-        return np.concatenate([fits, tilts.ravel(), values[len(views) * N_PLANE :] / np.array(PRIOR_SIGMA[2:])])
+        fit = _residuals(values, corners, places).ravel() / (noise_px / unit_px)
+        return np.concatenate([fit, values[6:] / np.array(PRIOR_SIGMA)])
 
     # 3: iterations of fit and noise estimate (chosen)
     for _ in range(3):
         fit = least_squares(misfit, values, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
-        residuals = _residuals(values, corners, places)
-        n_degrees = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
-        sum_of_squares = sum(float((view**2).sum()) for view in residuals)
+        squares_px = unit_px**2 * (_residuals(values, corners, places) ** 2).sum(axis=1)
         # 0.01: chosen: no corner is located better
-        noise_px = max(unit_px * np.sqrt(sum_of_squares / max(n_degrees, 1)), 0.01)
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac)
-    maps = []
-    for k in range(len(views)):
-        index = np.r_[k * N_PLANE : (k + 1) * N_PLANE, len(views) * N_PLANE : len(views) * N_PLANE + N_LENS]
-        metres = np.array([reach_m] * 6 + [1.0] * 4)
-        part = covariance[np.ix_(index, index)] * np.outer(metres, metres)
-        maps.append(PlaneMap(width_px, height_px, values[index] * metres, part))
-    return maps, float(np.sqrt(np.mean(np.concatenate([((view * unit_px) ** 2).sum(axis=1) for view in residuals]))))
+        noise_px = max(math.sqrt(squares_px.sum() / max(2 * len(corners) - N_PLANE - N_LENS, 1)), 0.01)
+    metres = np.array([reach_m] * 6 + [1.0] * 4)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * np.outer(metres, metres)
+    return PlaneMap(width_px, height_px, values * metres, covariance), math.sqrt(squares_px.mean())
 
 
 def _half_diagonals(picture_px: Floats, size: tuple[int, int]) -> Floats:
@@ -414,17 +389,13 @@ def _undistorted(distorted: Floats, lens: Floats) -> Floats:
     )
 
 
-def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> list[Floats]:
-    """Corners minus their predicted positions, half-diagonals, one array per view."""
-    lens = values[N_PLANE * len(corners) :]
-    residuals = []
-    for k, (corner, board) in enumerate(zip(corners, boards, strict=True)):
-        homography = np.append(values[k * N_PLANE : (k + 1) * N_PLANE], 1.0).reshape(3, 3)
-        projected = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
-        ideal = projected[:, :2] / projected[:, 2:]
-        radius2 = (ideal**2).sum(axis=-1, keepdims=True)
-        residuals.append(corner - ideal * (1 + lens[0] * radius2 + lens[1] * radius2**2))
-    return residuals
+def _residuals(values: Floats, corners: Floats, board: Floats) -> Floats:
+    """Corners minus their predicted positions, half-diagonals, shape (n, 2)."""
+    homography = np.append(values[:N_PLANE], 1.0).reshape(3, 3)
+    projected = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
+    ideal = projected[:, :2] / projected[:, 2:]
+    radius2 = (ideal**2).sum(axis=-1, keepdims=True)
+    return np.asarray(corners - ideal * (1 + values[8] * radius2 + values[9] * radius2**2))
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
@@ -548,8 +519,8 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 
 def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
     """Calibrate from pictures of a target, grey levels of shape (height, width) each. The corners of a stationary
-    target are averaged. Of a target that is moved every picture gets its own plane but all share the lens, and the
-    first readable one shows the plane of growth. Shapes: pictures (height, width).
+    target are averaged. Of a target that is moved the first readable picture shows the plane of growth, and is used
+    alone. Shapes: pictures (height, width).
     """
     views, complaints = [], []
     read = charuco_corners if isinstance(board, Charuco) else checkerboard_corners
@@ -564,12 +535,13 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     notes = [f"{board.image}: the target is read in {len(views)} of {len(pictures)} pictures"] if complaints else []
     moved_px = _target_motion_px(views)
     # 0.5: motion of the corners over a clip above which the target was moved (chosen)
-    stationary = moved_px < 0.5
-    if not stationary:
+    if not moved_px < 0.5:
         notes.append(
             f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
         )
-    maps, reprojection_px = fit_planes([_median_corners(views)] if stationary else views, width, height)
+        views = views[:1]
+    corners_px, board_m = _median_corners(views)
+    plane, reprojection_px = fit_plane(corners_px, board_m, width, height)
     # 2.0: distance of the corners from the model above which the board is another one (chosen)
     if reprojection_px > 2.0:
         raise CalibrationError(
@@ -578,7 +550,6 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
             "check `squares`, and that the board is flat",
             board.image,
         )
-    corners_px = _median_corners(views)[0] if stationary else views[0][0]
     # Beyond a target that spans less than half of the picture, scale and distortion are extrapolated.
     share = float(np.ptp(corners_px[:, 0 if width >= height else 1])) / max(width, height)
     if share < 0.5:
@@ -589,7 +560,7 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     bias_rel = 0.05 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
     return PlaneCalibration(
-        board.kind, maps[0], reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
+        board.kind, plane, reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
     )
 
 

@@ -21,6 +21,7 @@ from vinetrack.video.axis import (
     axis_through,
     find_axis,
     front_share,
+    length_along,
     share_on_front,
 )
 from vinetrack.video.frames import RecordingError
@@ -95,9 +96,8 @@ def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
 def find_curve(small: SmallPictures, band: Band | None = None) -> Axis | None:
     """Find the smoothed middle of the band that changed, from its first change to its last."""
     band = band or _changed_band(small)
-    path = None if band is None else _centreline(band)
     # 3.0: least length of the band, in its widths, that has a path (chosen)
-    if band is None or path is None or len(path) < 3.0 * band.width:
+    if band is None or len(path := _centreline(band)) < 3.0 * band.width:
         return None
     # Turned round where its pixels changed from its end to its beginning
     times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
@@ -159,13 +159,11 @@ def _changed_band(small: SmallPictures) -> Band | None:
     return Band(region, depth, when, 2 * half + 1)
 
 
-def _centreline(band: Band) -> Floats | None:
+def _centreline(band: Band) -> Floats:
     """Pixels (x, y) of the cheapest path along the middle of a band between its two most distant ends, shape (n, 2)."""
     from skimage.graph import MCP_Geometric
 
     rows, columns = np.nonzero(band.region)
-    if not rows.size:
-        return None
     blocked = np.full(band.region.shape, -1.0)
     unit_costs = np.where(band.region, 1.0, blocked)
     start = end = int(rows[0]), int(columns[0])
@@ -186,7 +184,7 @@ def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
     """
     from scipy.interpolate import make_smoothing_spline
 
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    along = length_along(path)
     inner = (along >= spacing / 2) & (along <= along[-1] - spacing / 2)
     if inner.sum() < 5:
         return None

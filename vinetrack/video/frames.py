@@ -12,22 +12,19 @@ import contextlib
 import math
 import os
 import threading
-from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
-from vinetrack.core.threads import njit
 
 if TYPE_CHECKING:
     import av
-
-    from vinetrack.video.strip import Strip
 
 
 # ------------------------------------------------------------------------------
@@ -43,18 +40,15 @@ NON_MARKING_DECODERS = frozenset(
 )
 
 
-HALF_TICK = 0.5  # Half a tick of a film's time base; times are whole ticks (derived)
-
-
 @dataclass
 class Decoded:
-    """Decoded frames in display order, with their times (NaN where unknown) and types. `pictures` has shape (n_frames,
-    height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key frames, `between` B frames, which
-    are coded from later frames too.
+    """Decoded frames in display order, with their times in ticks of the film (NaN where unknown) and types. `pictures`
+    has shape (n_frames, height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key frames,
+    `between` B frames, which are coded from later frames too.
     """
 
     pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
-    times_s: list[float] = field(default_factory=list)
+    ticks: list[float] = field(default_factory=list)
     corrupt: list[bool] = field(default_factory=list)
     key: list[bool] = field(default_factory=list)
     between: list[bool] = field(default_factory=list)
@@ -62,58 +56,46 @@ class Decoded:
     decoder: str = ""
 
 
-def decode_container(
-    path: Path, shape: tuple[int, int], expected: int | None = None, between_s: tuple[float, float] | None = None
-) -> Decoded:
-    """Decode every frame; a packet that cannot be decoded costs only its own frame. Pictures are written straight into
-    one array, so that they are held in memory once.
+def decode_container(recording: Recording, count: int, between: tuple[int, int] | None = None) -> Decoded:
+    """Decode every frame, or those from a tick to another; a packet that cannot be decoded costs only its own frame.
+    Memory is taken for `count` frames, or for more where they come.
     """
     import av
 
-    decoded, available_bytes = Decoded(), memory_for_pictures()
-    buffer: NDArray[Any] | None = None
-    with quiet_log() as messages:
+    decoded = Decoded()
+
+    def pictures() -> Generator[NDArray[Any]]:
         try:
-            with open_film(path) as container:
+            with open_film(recording.path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS
                 decoded.decoder = stream.codec_context.name
-                base = float(stream.time_base) if stream.time_base else 1.0
-                if between_s is not None:
-                    container.seek(max(int(between_s[0] / base), 0), stream=stream)
+                if between is not None:
+                    container.seek(max(between[0], 0), stream=stream)
                 for frame in _frames_of(container.demux(stream), messages):
-                    if between_s is not None:
-                        if frame.pts is None or frame.pts * base < between_s[0] - HALF_TICK * base:
+                    if between is not None:
+                        if frame.pts is None or frame.pts < between[0]:
                             continue
-                        if frame.pts * base > between_s[1] + HALF_TICK * base:
+                        if frame.pts > between[1]:
                             break
-                    if (frame.height, frame.width) != shape:
+                    if (frame.height, frame.width) != (recording.height, recording.width):
                         messages.append("the size of the picture changes")
                         break
                     picture = luma_plane(frame)
-                    n = len(decoded.times_s)
-                    if (n + 1) * picture.nbytes > available_bytes:
-                        raise MemoryError
-                    if buffer is None:  # untouched memory takes no space
-                        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
-                        fits = expected and expected * picture.nbytes <= available_bytes
-                        buffer = np.empty((expected if fits else 256, *picture.shape), picture.dtype)
-                    elif n == len(buffer):
-                        small, buffer = buffer, np.empty((n + n // 2 + 1, *picture.shape), picture.dtype)
-                        buffer[:n] = small
-                    buffer[n] = picture
-                    decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base)
+                    decoded.ticks.append(math.nan if frame.pts is None else frame.pts)
                     decoded.corrupt.append(bool(frame.is_corrupt))
                     decoded.key.append(bool(frame.key_frame))
                     decoded.between.append(frame.pict_type == 3)  # 3: code of a B frame (defined)
+                    yield picture
         except av.error.FFmpegError as error:
             messages.append(str(error.strerror or error))
+
+    with quiet_log() as messages, contextlib.closing(pictures()) as taken:
+        decoded.pictures = filled(recording, taken, count)
     decoded.messages = list(messages)
-    if buffer is not None:
-        decoded.pictures = buffer[: len(decoded.times_s)]
-    if decoded.messages and decoded.times_s and decoded.decoder in NON_MARKING_DECODERS:
-        marked = _times_of_faulty_packets(path)
-        decoded.corrupt = [time_s in marked for time_s in decoded.times_s]
+    if decoded.messages and decoded.ticks and decoded.decoder in NON_MARKING_DECODERS:
+        marked = _ticks_of_faulty_packets(recording.path)
+        decoded.corrupt = [ticks in marked for ticks in decoded.ticks]
     return decoded
 
 
@@ -132,42 +114,33 @@ def damaged_frames(decoded: Decoded, slot: Indices) -> Bools:
     return damaged
 
 
-@dataclass(frozen=True)
-class PacketIndex:
-    """All frames of a film in display order, shapes (n_frames,). `pts` is the presentation time in units of `base_s`,
-    `key` marks key frames.
+class PacketIndex(NamedTuple):
+    """All frames of a film in display order: their times in ticks, and whether each is a key frame. Shapes
+    (n_frames,).
     """
 
-    pts: NDArray[np.int64]
+    ticks: NDArray[np.int64]
     key: Bools
-    base_s: float
-
-    @property
-    def times_s(self) -> Floats:
-        """Time of every frame, s."""
-        return np.asarray(self.pts * self.base_s, dtype=np.float64)
 
 
 def packet_index(path: Path) -> PacketIndex | None:
     """List the frames of a film without decoding them."""
     import av
 
-    pts, key = [], []
+    ticks, key = [], []
     with quiet_log(), contextlib.suppress(av.error.FFmpegError), av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        base = float(stream.time_base) if stream.time_base else 1.0
-        for packet in container.demux(stream):
+        for packet in container.demux(video=0):
             if not packet.size:
                 continue
             if packet.pts is None:
                 return None
-            pts.append(packet.pts)
+            ticks.append(packet.pts)
             key.append(packet.is_keyframe)
-    order = np.argsort(pts)
-    times = np.array(pts, dtype=np.int64)[order]
+    order = np.argsort(ticks)
+    times = np.array(ticks, dtype=np.int64)[order]
     if len(times) < 2 or np.any(np.diff(times) <= 0):
         return None
-    return PacketIndex(times, np.array(key, dtype=bool)[order], base)
+    return PacketIndex(times, np.array(key, dtype=bool)[order])
 
 
 def decode_packets(path: Path, chosen: Container[int] | None) -> Iterator[av.VideoFrame]:
@@ -210,23 +183,22 @@ def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterat
             messages.append(str(error.strerror or error))
 
 
-def _times_of_faulty_packets(path: Path) -> set[float]:
-    """Return the times of the packets about which the decoder logs an error. The film is decoded once more, with one
+def _ticks_of_faulty_packets(path: Path) -> set[int]:
+    """Return the ticks of the packets about which the decoder logs an error. The film is decoded once more, with one
     thread, so that each message can be assigned to its packet.
     """
     import av
     import av.logging
 
-    marked: set[float] = set()
+    marked: set[int] = set()
     with quiet_log(), open_film(path) as container, contextlib.suppress(av.error.FFmpegError):
         stream = container.streams.video[0]
         stream.codec_context.thread_count = 1
-        base = float(stream.time_base) if stream.time_base else 1.0
         for packet in container.demux(stream):
             with av.logging.Capture(True) as messages, contextlib.suppress(av.error.FFmpegError):
                 packet.decode()
             if messages and packet.pts is not None:
-                marked.add(packet.pts * base)
+                marked.add(packet.pts)
     return marked
 
 
@@ -263,7 +235,7 @@ def quiet_log() -> Iterator[list[str]]:
 
 
 # ------------------------------------------------------------------------------
-# Detect pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies.
+# Detect pictures that are not what the camera saw at their time: torn ones, and odd ones at the beginning.
 
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
@@ -313,48 +285,6 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     for i in range(3):
         odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
     return odd
-
-
-def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
-    """Frames in which the surroundings of the edge repeat those of the frame before. The change of the picture is
-    compared with that where the edge moves, and the edge must stand still between frames that show it moving on.
-    Shapes: edge_px (n_frames,) → (n_frames,).
-    """
-    around_px = 40  # Columns on either side of the edge that are compared (chosen)
-    clear_step_px = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
-    n, _, columns = strip.values.shape
-    seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
-    low = np.clip(seen_px - around_px, 0, columns - 1).astype(int)
-    high = np.maximum(np.clip(seen_px + around_px, 1, columns).astype(int), low + 1)
-    change = np.where(np.isfinite(edge_px), _changes_between(strip.values, low, high) * strip.scale, np.inf)
-    moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > clear_step_px / 2
-    median_change = float(np.median(change[moving])) if moving.any() else np.inf
-    repeated = np.zeros(n, dtype=bool)
-    for i in range(2, n - 1):
-        mean_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        # 0.1, 0.15: A copy moves less than this part of a step, and its picture changes by less than this
-        # part of the median (chosen)
-        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * mean_step
-        repeated[i] = mean_step > clear_step_px and stands and change[i] < 0.15 * median_change
-    return repeated
-
-
-@njit(nogil=True)
-def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
-    The first has none before it: infinity.
-    """
-    n, rows, _ = values.shape
-    out = np.full(n, np.inf)
-    for t in range(1, n):
-        total = np.int64(0)
-        for u in range(0, rows, 2):
-            before, after = values[t - 1, u, low[t] : high[t]], values[t, u, low[t] : high[t]]
-            for s in range(len(before)):
-                total += abs(np.int32(after[s]) - np.int32(before[s]))
-        out[t] = total / ((rows + 1) // 2 * (high[t] - low[t]))
-    return out
 
 
 DECODER_THREADS = 2  # Decoder threads per recording (chosen)
@@ -439,27 +369,41 @@ def inspect_recording(path: Path | str) -> Recording:
     return _inspect_container(path)
 
 
-def read_frames(path: Path | str | Recording, part: tuple[int, int, PacketIndex] | None = None) -> Frames:
-    """Decode all frames of a recording, or a part of a film: from a frame to another, by its index."""
+def read_frames(
+    path: Path | str | Recording, part: tuple[int, int] | None = None, index: PacketIndex | None = None
+) -> Frames:
+    """Decode all frames of a recording, or those from a frame to another; a part of a film needs its index."""
     recording = path if isinstance(path, Recording) else inspect_recording(path)
+    if recording.kind == "container":
+        return _read_film(recording, part, index)
     if recording.raw is not None:
-        return read_raw(recording, recording.raw)
-    if recording.kind != "container":
-        from vinetrack.video.images import read_images
+        return _read_raw(recording, recording.raw, part)
+    from vinetrack.video.images import read_images
 
-        return read_images(recording)
-    expected, between_s = recording.declared_frames, None
-    if part is not None:
-        first, last, index = part
-        expected, between_s = last - first + 1, (float(index.times_s[first]), float(index.times_s[last]))
-    try:
-        decoded = decode_container(recording.path, (recording.height, recording.width), expected, between_s)
-    except MemoryError:
-        raise too_large(recording) from None
-    return _assemble(recording, decoded, None if part is None else part[2])
+    return read_images(recording)
 
 
-def too_large(recording: Recording) -> RecordingError:
+def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -> NDArray[Any]:
+    """Write pictures straight into one array, for `count` of them or longer where more come, unless they do not fit in
+    memory.
+    """
+    pixel_bytes = 1 if recording.bit_depth <= 8 else 2
+    most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
+    luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
+    if count > most:
+        raise _too_large(recording)
+    for n, picture in enumerate(pictures, 1):
+        if n > most:
+            raise _too_large(recording)
+        if n == 1:  # untouched memory takes no space
+            luma = np.empty((count, *picture.shape), picture.dtype)
+        if n > len(luma):
+            luma = np.concatenate([luma, np.empty_like(luma[: n // 2 + 1])])
+        luma[n - 1] = picture
+    return luma[:n]
+
+
+def _too_large(recording: Recording) -> RecordingError:
     """Make the error for a recording that does not fit in memory."""
     return RecordingError(
         f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
@@ -474,9 +418,9 @@ def iterate_frames(recording: Recording) -> Iterator[NDArray[Any]]:
         yield from recording.raw.pictures()
         return
     if recording.kind != "container":
-        from vinetrack.video.images import iterate_images
+        from vinetrack.video.images import pictures_of
 
-        yield from iterate_images(recording)
+        yield from (picture for picture, _ in pictures_of(recording))
         return
     import av
 
@@ -538,43 +482,53 @@ def _inspect_container(path: Path) -> Recording:
         raise RecordingError(*why, path.name) from error
 
 
-def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None) -> Frames:
-    n = len(decoded.times_s)
-    name = recording.path.name
+def _read_film(recording: Recording, part: tuple[int, int] | None, index: PacketIndex | None) -> Frames:
+    """Decode a film, or a part of it by its index."""
+    name, notes, declared = recording.path.name, list(recording.notes), recording.declared_frames or 0
+    if part is None or index is None:
+        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
+        decoded = decode_container(recording, declared or 256)
+        ticks, number = np.array(decoded.ticks), np.arange(len(decoded.ticks))
+    else:
+        first, last = part
+        decoded = decode_container(recording, last - first + 1, (int(index.ticks[first]), int(index.ticks[last])))
+        ticks, number = index.ticks, np.searchsorted(index.ticks, decoded.ticks)
+    n = len(number)
     if n == 0:
         raise RecordingError("not one frame can be decoded", "the file is damaged", name)
-    notes = list(recording.notes)
-    there = n if index is None else len(index.pts)
-    if recording.declared_frames is not None and there < recording.declared_frames:
+    if len(ticks) < declared:
         notes.append(
-            f"{name}: {there} frames {'decoded' if index is None else 'are there'} where the file declares "
-            f"{recording.declared_frames}: cut short or damaged; copy it from the camera again"
+            f"{name}: {len(ticks)} frames are there where the file declares {declared}: cut short or damaged; copy it "
+            "from the camera again"
         )
-    undecoded = max((recording.declared_frames or 0) - there, 0)
-    times_s = np.array(decoded.times_s)
-    before = after = slot = np.zeros(0, dtype=int)
-    if index is None:
-        slot, irregular = slots_from_times(times_s, undecoded)
-    else:
-        slots, irregular = slots_from_times(index.times_s, undecoded)
-        number = np.searchsorted(index.times_s, times_s - HALF_TICK * index.base_s)
-        before, slot, after = slots[: number[0]], slots[number], slots[number[-1] + 1 :]
-        notes.append(
-            f"{name}: of {there} frames only {number[0]} to {number[-1]}, around the motion, are decoded; set others "
-            "in frames_used"
-        )
+    frames = frames_at(recording, decoded.pictures, ticks, number, lost=max(declared - len(ticks), 0))
     if decoded.decoder in NON_MARKING_DECODERS:
         decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()
-    damaged = damaged_frames(decoded, slot)
+    damaged = damaged_frames(decoded, frames.slot)
     if decoded.messages or damaged.any():
         first_message = f"; the first: {decoded.messages[0].strip()}" if decoded.messages else ""
         notes.append(
             f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or coded from corrupt ones"
             f" ({len(decoded.messages)} messages of the decoder{first_message})"
         )
-    if irregular:
-        notes.append(f"{name}: {irregular}")
-    return Frames(recording, decoded.pictures, slot, damaged, tuple(notes), before, after)
+    return replace(frames, damaged=damaged, notes=(*notes, *frames.notes))
+
+
+def frames_at(recording: Recording, luma: NDArray[Any], times: NDArray[Any], number: Indices, lost: int = 0) -> Frames:
+    """Frames, none of them damaged, that are the `number`s of those of a recording at these times, in any unit; as many
+    as `lost` are known to be missing. Shapes: luma (n_frames, height, width); number (n_frames,); times (n_recorded,).
+    """
+    slots, irregular = slots_from_times(times, lost)
+    notes, first, last = [], int(number[0]), int(number[-1])
+    if len(number) < len(times):
+        notes.append(
+            f"of {len(times)} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
+        )
+    notes += [irregular] if irregular else []
+    return Frames(
+        recording, luma, slots[number], np.zeros(len(luma), dtype=bool),
+        tuple(f"{recording.path.name}: {note}" for note in notes), slots[:first], slots[last + 1 :],
+    )  # fmt: skip
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[Indices, str]:
@@ -589,18 +543,18 @@ def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tupl
     steps = np.diff(times)
     period = float(np.median(steps))
     if period <= 0 or np.any(steps <= 0):
-        return plain, "timestamps repeat or run backwards; frames are timed by their index"
+        return plain, "times repeat or run backwards; frames are timed by their index"
     # Times in whole milliseconds alternate between, say, steps of 16 and 17: over a long gap only their mean is right.
     period = float(np.mean(steps[steps < 1.5 * period]))
     periods = steps / period
     if np.any(np.abs(periods - np.rint(periods)) > 0.25) or np.any(np.rint(periods) < 1):
-        return plain, "the container's frame rate varies; frames are timed by their index"
+        return plain, "its frame rate varies; frames are timed by their index"
     slot = np.concatenate([[0], np.cumsum(np.rint(periods).astype(int))])
     missing = int(slot[-1] - plain[-1])
     # Cameras drop single frames; if a tenth of all frames seems missing, the container counts in other units.
     if missing == 0 or missing > max(3, len(times) // 10, known_missing):
-        return plain, "" if missing == 0 else "its timestamps are irregular; frames are timed by their index"
-    return slot, f"{missing} frames are missing according to the timestamps; the others keep their own times"
+        return plain, "" if missing == 0 else "its times are irregular; frames are timed by their index"
+    return slot, f"{missing} frames are missing by the times or numbers of the others, which keep their own times"
 
 
 # ------------------------------------------------------------------------------
@@ -650,11 +604,6 @@ class RawFrames:
         """Size of a frame in the file, bytes."""
         return self.width * self.height * self.stored_bits // 8
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the pixels that `pictures` yields."""
-        return np.dtype(np.uint8 if self.stored_bits == 8 else np.uint16)
-
     def pictures(self) -> Iterator[NDArray[Any]]:
         """Yield one frame after another, shape (height, width); stop where the file ends."""
         with self.file.open("rb") as stream:
@@ -696,30 +645,19 @@ def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
     return np.rint(cv2.sepFilter2D(mosaic.astype(np.float32), -1, kernel, kernel)).astype(mosaic.dtype)
 
 
-def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Write up to `count` pictures straight into one array, unless they do not fit in memory."""
-    shape = count, recording.height, recording.width
-    if math.prod(shape) * dtype.itemsize > memory_for_pictures():
-        raise too_large(recording)
-    luma, n = np.empty(shape, dtype), 0
-    for n, picture in enumerate(pictures, 1):
-        luma[n - 1] = picture
-    return luma[:n]
-
-
-def read_raw(recording: Recording, raw: RawFrames) -> Frames:
-    """Read every frame of a camera's own file."""
-    name, notes = recording.path.name, list(recording.notes)
-    luma = filled(recording, raw.pictures(), len(raw.offsets), raw.dtype)
-    n = len(luma)
+def _read_raw(recording: Recording, raw: RawFrames, part: tuple[int, int] | None) -> Frames:
+    """Read the frames of a camera's own file, or a part of them."""
+    name, notes, count = recording.path.name, list(recording.notes), len(raw.offsets)
+    first, last = part or (0, count - 1)
+    luma = filled(recording, replace(raw, offsets=raw.offsets[first : last + 1]).pictures(), last - first + 1)
+    n, expected = len(luma), last - first + 1 if part else recording.declared_frames or 0
     if n == 0:
         raise RecordingError("not one frame is in the file", "copy it from the camera again", name)
-    if recording.declared_frames is not None and n < recording.declared_frames:
+    if n < expected:
         notes.append(
-            f"{name}: the file holds {n} frames but declares {recording.declared_frames}: cut short; "
-            "copy it from the camera again"
+            f"{name}: the file holds {n} frames but declares {expected}: cut short; copy it from the camera again"
         )
-    slot, irregular = (np.arange(n), "") if raw.times_s is None else slots_from_times(raw.times_s[:n])
-    if irregular:
-        notes.append(f"{name}: {irregular}")
-    return Frames(recording, luma, slot, np.zeros(n, dtype=bool), tuple(notes))
+    there = count if part else n
+    times = np.arange(there) if raw.times_s is None else raw.times_s[:there]
+    frames = frames_at(recording, luma, times, first + np.arange(n))
+    return replace(frames, notes=(*notes, *frames.notes))

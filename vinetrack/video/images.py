@@ -22,6 +22,7 @@ from vinetrack.video.frames import (
     Recording,
     RecordingError,
     filled,
+    frames_at,
     mosaic_brightness,
     unpack_pixels,
 )
@@ -347,33 +348,17 @@ def inspect_images(path: Path) -> Recording:
 
 def read_images(recording: Recording) -> Frames:
     """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
-    name, notes = recording.path.name, list(recording.notes)
-    count, dtype = recording.declared_frames or 0, np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
-    is_damaged: list[bool] = []
-
-    # Decoders silently fill a missing part with grey: a JPEG or PNG must have its end marker.
-    markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
+    name, count, whole = recording.path.name, recording.declared_frames or 0, []
 
     def pictures() -> Iterator[NDArray[Any]]:
-        for file in recording.files:
-            picture = _read_or_none(file)
-            if picture is None or picture.shape != (recording.height, recording.width):
-                picture, whole = np.zeros((recording.height, recording.width), dtype), False
-            else:
-                with file.open("rb") as stream:
-                    stream.seek(max(file.stat().st_size - 64, 0))
-                    whole = markers.get(file.suffix.lower(), b"") in stream.read()
-            is_damaged.append(not whole)
+        for picture, is_whole in pictures_of(recording):
+            whole.append(is_whole)
             yield picture
 
-    if recording.kind == "stack":
-        luma = filled(recording, _stack_pages(recording), count, dtype)
-        damaged = np.zeros(len(luma), dtype=bool)
-        if len(luma) < count:
-            notes.append(f"{name}: {len(luma)} pages read where the stack declares {count}: cut short")
-    else:
-        luma = filled(recording, pictures(), count, dtype)
-        damaged = np.array(is_damaged)
+    luma = filled(recording, pictures(), count)
+    damaged, notes = ~np.array(whole, dtype=bool), list(recording.notes)
+    if len(luma) < count:
+        notes.append(f"{name}: {len(luma)} pages read where the stack declares {count}: cut short")
     if damaged.all():
         raise RecordingError("not one picture can be read", "the files are damaged", name)
     if damaged.any():
@@ -381,28 +366,27 @@ def read_images(recording: Recording) -> Frames:
         notes.append(
             f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {first}"
         )
-    slot = np.arange(len(luma))
-    if len(recording.numbers) > 2:  # of the files, which may count in any step
-        steps = np.diff(recording.numbers)
-        step = int(np.median(steps))
-        if step > 0 and not np.any(steps % step) and np.all(steps > 0):
-            periods = np.concatenate([[0], np.cumsum(steps // step)])
-            missing = int(periods[-1] - slot[-1])
-            if 0 < missing <= max(3, len(slot) // 10):
-                slot = periods
-                notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
-    return Frames(recording, luma, slot, damaged, tuple(notes))
+    number = np.arange(len(luma))  # the files may be numbered in any step
+    frames = frames_at(recording, luma, np.array(recording.numbers) if recording.numbers else number, number)
+    return replace(frames, damaged=damaged, notes=(*notes, *frames.notes))
 
 
-def iterate_images(recording: Recording) -> Iterator[NDArray[Any]]:
-    """Yield each picture that can be read."""
+def pictures_of(recording: Recording) -> Iterator[tuple[NDArray[Any], bool]]:
+    """Each picture, and whether it is whole. One that cannot be read is black; a stack ends before it."""
     if recording.kind == "stack":
-        yield from _stack_pages(recording)
+        yield from ((page, True) for page in _stack_pages(recording))
         return
+    shape, dtype = (recording.height, recording.width), np.uint8 if recording.bit_depth <= 8 else np.uint16
+    # Decoders silently fill a missing part with grey: a JPEG or PNG must have its end marker.
+    markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
     for file in recording.files:
         picture = _read_or_none(file)
-        if picture is not None and picture.shape == (recording.height, recording.width):
-            yield picture
+        if picture is None or picture.shape != shape:
+            yield np.zeros(shape, dtype), False
+            continue
+        with file.open("rb") as stream:
+            stream.seek(max(file.stat().st_size - 64, 0))
+            yield picture, markers.get(file.suffix.lower(), b"") in stream.read()
 
 
 def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tuple[str, ...]]:

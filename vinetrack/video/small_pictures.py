@@ -24,7 +24,6 @@ from vinetrack.video.frames import (
     luma_plane,
     packet_index,
     read_frames,
-    slots_from_times,
 )
 from vinetrack.video.kymograph import largest_steps
 
@@ -203,16 +202,20 @@ MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, adde
 
 
 def read_event(recording: Recording, frame_range: tuple[int, int] | None = None) -> Frames:
-    """Decode the frames that show the event; the whole recording if it is small or if no event stands out."""
-    count = recording.declared_frames or 0
+    """Decode the frames that show the event, or those of a range; the whole recording if it is small, if its frames
+    cannot be read one by one, or if no event stands out.
+    """
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
-    if count * recording.width * recording.height * pixel_bytes <= MAX_BYTES_WHOLE:
+    if (recording.declared_frames or 0) * recording.width * recording.height * pixel_bytes <= MAX_BYTES_WHOLE:
         return read_frames(recording)
-    if recording.raw is not None:
-        return _raw_event(recording, frame_range)
-    if recording.kind == "container":
-        return _film_event(recording, frame_range)
-    return read_frames(recording)
+    raw, index = recording.raw, packet_index(recording.path) if recording.kind == "container" else None
+    count = len(raw.offsets) if raw else len(index.ticks) if index else 0
+    if count < MAX_SAMPLE_INTERVAL:
+        return read_frames(recording)
+    frame_range = frame_range or event_range(*_samples(recording, index), count)
+    if frame_range is None or frame_range[0] >= count:
+        return read_frames(recording)
+    return read_frames(recording, (frame_range[0], min(frame_range[1], count - 1)), index)
 
 
 def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int) -> tuple[int, int] | None:
@@ -253,69 +256,33 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int)
     return max(start - margin, 0), min(stop + margin, count - 1)
 
 
-def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
-    """Decode the event of a film; the whole film if its packets cannot be assigned to frames."""
-    index = packet_index(recording.path)
-    if index is None or len(index.pts) < MAX_SAMPLE_INTERVAL:
-        return read_frames(recording)
-    count = len(index.pts)
-    if frame_range is None:
-        pictures, numbers = _sample_film(recording, index)
-        frame_range = event_range(pictures, numbers, count)
-        pictures.clear()
-    if frame_range is None or frame_range[0] >= count or frame_range == (0, count - 1):
-        return read_frames(recording)
-    return read_frames(recording, part=(frame_range[0], min(frame_range[1], count - 1), index))
-
-
-def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray[np.uint8]], Indices]:
-    """Sample the key frames of a film or, if these are too rare, every n-th frame of the whole film."""
-    keys = np.flatnonzero(index.key)
+def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDArray[np.uint8]], Indices]:
+    """Every n-th frame, shrunk, and their numbers; of a film the key frames, unless these are too rare."""
+    if (raw := recording.raw) is not None:
+        every = -(-len(raw.offsets) // MAX_SAMPLES)
+        pictures = [_shrunk(picture, recording) for picture in replace(raw, offsets=raw.offsets[::every]).pictures()]
+        return pictures, every * np.arange(len(pictures))
+    assert index is not None
+    count, keys = len(index.ticks), np.flatnonzero(index.key)
     # Key frames so close to each other that no event fits between two of them
-    keys_only = len(keys) > 1 and max(int(np.diff(keys).max()), len(index.pts) - int(keys[-1])) <= MAX_SAMPLE_INTERVAL
-    candidates = keys if keys_only else np.arange(len(index.pts))
-    chosen = {int(index.pts[i]): int(i) for i in candidates[:: max(1, -(-len(candidates) // MAX_SAMPLES))]}
-    pictures = {}
+    keys_only = len(keys) > 1 and np.diff(keys, append=count).max() <= MAX_SAMPLE_INTERVAL
+    candidates = keys if keys_only else np.arange(count)
+    chosen = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
+    sampled = {}
     for frame in decode_packets(recording.path, set(chosen) if keys_only else None):
         number = None if frame.pts is None else chosen.get(frame.pts)
         if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-            pictures[number] = _shrunk(luma_plane(frame), recording.bit_depth)
-    numbers = sorted(pictures)
-    return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
+            sampled[number] = _shrunk(luma_plane(frame), recording)
+    numbers = sorted(sampled)
+    return [sampled[number] for number in numbers], np.array(numbers, dtype=int)
 
 
-def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
-    """Read the event of a file in a camera's own format."""
-    raw = recording.raw
-    assert raw is not None
-    count = len(raw.offsets)
-    if frame_range is None:
-        every = max(1, -(-count // MAX_SAMPLES))
-        sparse = replace(raw, offsets=raw.offsets[::every])
-        pictures = [_shrunk(picture, recording.bit_depth) for picture in sparse.pictures()]
-        frame_range = event_range(pictures, every * np.arange(len(pictures)), count)
-    if frame_range is None or frame_range[0] >= count:
-        return read_frames(recording)
-    first, last = frame_range[0], min(frame_range[1], count - 1)
-    slots, irregular = (np.arange(count), "") if raw.times_s is None else slots_from_times(raw.times_s[:count])
-    part = replace(raw, offsets=raw.offsets[first : last + 1], times_s=None)
-    frames = read_frames(replace(recording, raw=part, declared_frames=len(part.offsets)))
-    part_read = f"of {count} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
-    notes = [f"{recording.path.name}: {note}" for note in (part_read, irregular) if note]
-    end = first + len(frames)
-    return replace(
-        frames, recording=recording, slot=slots[first:end], notes=(*frames.notes, *notes),
-        slots_before=slots[:first], slots_after=slots[end:],
-    )  # fmt: skip
-
-
-def _shrunk(picture: NDArray[Any], bit_depth: int = 8) -> NDArray[np.uint8]:
+def _shrunk(picture: NDArray[Any], recording: Recording) -> NDArray[np.uint8]:
     """Shrink a picture to at most 320 px (chosen), grey levels of 255."""
     import cv2
 
-    height, width = picture.shape
-    factor = max(1.0, max(height, width) / 320)
-    size = (max(8, round(width / factor)), max(8, round(height / factor)))
+    factor = max(1.0, max(picture.shape) / 320)
+    size = (max(8, round(recording.width / factor)), max(8, round(recording.height / factor)))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    scale = 1.0 if picture.dtype == np.uint8 else 255.0 / (2**bit_depth - 1)
-    return np.asarray(small if scale == 1.0 else np.minimum(small * scale, 255).astype(np.uint8))
+    scale = 1.0 if picture.dtype == np.uint8 else 255.0 / (2**recording.bit_depth - 1)
+    return np.asarray(cv2.convertScaleAbs(small, alpha=scale), np.uint8)
