@@ -39,7 +39,7 @@ BUDGETS = {
     "narrative": (1264, 3, 11),
     "pages": (2797, 8, 21),
     "paper": (839, 3, 15),
-    "pipeline": (2442, 8, 9),
+    "pipeline": (2459, 8, 9),
     "planning": (1587, 4, 17),
     "report": (682, 2, 3),
     "results": (248, 2, 8),

@@ -245,7 +245,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
         if len(ids) < 6 or not n_markers <= count <= n_markers + 2:
             continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
-        board = Charuco(kind="charuco", image="", squares=layout, square_mm=1.0, marker_mm=0.7, dictionary=family)
+        board = Charuco(kind="charuco", image="seen", squares=layout, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
             best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
