@@ -585,8 +585,8 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # 25.0: growth over which that error falls to 1/e (chosen)
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
     near = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
-    # 0.15, 0.7: error that a door adds, px, in full from such an excess of the mean misfit near the start (chosen)
-    door = 0.15 * float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
+    # 0.5, 0.7: error that a door adds, px, in full from such an excess of the mean misfit near the start (chosen)
+    door = 0.5 * float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
     start_error = (START_ERROR_PX + door) * near_start
     bands, shared = band_disagreement(strip, state, edge_now, core)
     bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
