@@ -278,6 +278,29 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     return at_mouth, bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
+def disturbed_start(strip: Strip, state: EdgeState) -> float:
+    """Share of the columns at the start that change before the edge reaches them: a door swings there."""
+    # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
+    door_columns, door_frames = (6, 10), 15
+    begin, columns = state.edge[0], strip.values.shape[2]
+    column_range = np.arange(int(begin) + door_columns[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
+    moving = np.flatnonzero(moving_frames(state.edge))
+    if len(column_range) < door_columns[1] or moving[0] < 2:
+        return 0.0
+    first = max(0, int(moving[0]) - door_frames)
+    rising = np.maximum.accumulate(state.edge)
+    contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
+    changed = 0
+    for column in column_range:
+        arrival = int(np.searchsorted(rising, column - 5.0))
+        frames, here = slice(first, max(arrival - 1, first + 1)), slice(column, column + 1)
+        change = np.ptp(strip.brightness(frames, here).mean(axis=(1, 2)))
+        # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
+        # and by so many grey levels (chosen)
+        changed += change > max(0.25 * contrast, 4.0)
+    return changed / len(column_range)
+
+
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
     """Enlarge the errors of frames in which a door still hides the tip. There the edge is a guess; where the picture
     differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames, 6);
@@ -585,8 +608,10 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # 25.0: growth over which that error falls to 1/e (chosen)
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
     near = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
-    # 0.5, 0.7: error that a door adds, px, in full from such an excess of the mean misfit near the start (chosen)
-    door = 0.5 * float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
+    # 0.5: error added if a door crosses the whole strip before growth, px, and in full from an excess of the mean
+    # misfit ratio near the start of 0.7 on (chosen)
+    door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
+    door = 0.5 * disturbed_start(strip, state) * door_weight
     start_error = (START_ERROR_PX + door) * near_start
     bands, shared = band_disagreement(strip, state, edge_now, core)
     bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
