@@ -1,4 +1,4 @@
-"""Quality of each point of a track: release, end, lost and doubtful points.
+"""Quality of each point of a track: release, end, lost and doubtful points, repeated frames.
 
 Works on positions alone, in pixels by frame, from any tracker.
 """
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
+from vinetrack.video.strip import Strip
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 FLOOR_PX = 0.04  # Standard error that no check shows
@@ -93,7 +94,9 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
     return last_at_rest + 1 if last_at_rest >= 2 else 0
 
 
-def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, end_px: float) -> PointQuality:
+def assess_points(
+    edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, repeated: Bools, end_px: float
+) -> PointQuality:
     """Flag every frame. Arrays have shape (n_frames,)."""
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
@@ -104,12 +107,17 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
     notes = []
     if first_outside < n:
         notes.append(f"the leading edge leaves the picture at frame {number[first_outside]}; later frames are not used")
+    repeats = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
+    if repeats.any():
+        count, first_repeat = int(repeats.sum()), number[repeats][0]
+        notes.append(f"{count} frames repeat the one before them and are dropped, first frame {first_repeat}")
     without_edge = no_edge & (np.arange(n) < first_outside)
     flags = [
         join_flags(
             "before_release" if i < first else "",
             "after_end" if i > last >= 0 or i >= first_outside else "",
             "lost" if without_edge[i] else "",
+            "duplicate" if repeats[i] else "",
             "doubtful" if unsure[i] and not no_edge[i] else "",
         )
         for i in range(n)
@@ -125,19 +133,26 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
 
 
 # ------------------------------------------------------------------------------
-# Why a motion ended, in words: the whole vine has grown, an obstacle stops it, or the recording ends.
+# Where growth ends though something flies on, and why a motion ended, in words.
+#
+# A payload in free flight leaves background behind it; film stays. A motion ends when the whole vine has grown, when
+# an obstacle stops it, or when the recording ends.
+
+
+SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
 
 
 @dataclass(frozen=True)
 class Ending:
     """How an edge ends: its way from standstill to standstill, and until the last frame where it still moves there, px
-    (NaN otherwise); and a `remark` on where it stopped.
+    (NaN otherwise); `remarks` on where it stopped, and the `place` of all this among the notes.
     """
 
-    name: str
     grown_px: float = math.nan
     truncated_px: float = math.nan
-    remark: str = ""
+    remarks: tuple[str, ...] = ()
+    name: str = ""
+    place: int = 0
 
     def notes(self, length_px: float) -> list[str]:
         """What a track is told about its end; nothing where the whole vine has grown."""
@@ -145,13 +160,14 @@ class Ending:
         if abs(self.grown_px / length_px - 1) < 0.03:
             return []
         share = f", after {self.truncated_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
-        moves = f"the recording ends while the leading edge moves{share}" if np.isfinite(self.truncated_px) else ""
-        return [f"{self.name}: {note}" for note in (self.remark, moves) if note]
+        moves = f"{self.name}: the recording ends while the leading edge moves{share}"
+        return [*self.remarks, *([moves] if np.isfinite(self.truncated_px) else [])]
 
 
 def ending_of(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool
-) -> Ending:
+    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool,
+    place: int,
+) -> Ending:  # fmt: skip
     """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: luma (n_frames, height, width);
     edge_px, number (n_frames,).
     """
@@ -169,15 +185,66 @@ def ending_of(
         before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
         least, later = float(np.min(change)), float(np.median(change[last + 1 :]))
         resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
-        where = (
-            f"the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}" if resting.size else ""
-        )
+        where = f"{name}: the leading edge stops at {np.median(resting) if resting.size else np.nan:.0f} px"
+        where = f"{where} after frame {number[last]}"
         # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
         # changing (chosen)
         if not resting.size:
-            remark = f"the leading edge is not seen after frame {number[last]}"
+            remark = f"{name}: the leading edge is not seen after frame {number[last]}"
         elif later - least > 0.3 * (before - least):
             remark = f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"
         else:
             remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
-    return Ending(name, grown_px, truncated_px, remark)
+    return Ending(grown_px, truncated_px, (remark,) if remark else (), name, place)
+
+
+def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
+    """Column at which the film ends although something moves on; the end of `passed` where nothing does. Going
+    backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns that
+    look as they did before anything came, then film. Shapes: path (n_frames,).
+    """
+    # Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
+    film_parts = (0.7, 0.35, 0.175)
+    flight_speed_ratio = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
+    columns, frames = np.arange(passed[0], passed[1]), len(path)
+    if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
+        return passed[1]
+    arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
+    # Mean square over the rows of the last minus the first looks at each column, averaged over 5
+    last, difference = _mean(strip, slice(frames - 2, frames), columns), np.zeros(len(columns))
+    for when in np.unique(arrival):
+        those = arrival == when
+        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
+        difference[those] = np.mean((last[:, those] - before) ** 2, axis=0)
+    noise = strip.noise**2 * (0.5 + 0.2)
+    difference = np.convolve(np.clip(difference - noise, 0, None), np.ones(5) / 5, mode="same")
+    film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in film_parts)
+    # 0.2: share of the film's median difference from the background (chosen)
+    is_bare = difference < 0.2 * film_difference
+    # First of SHORTEST_BARE_PX or more bare columns in a row, with no more after it that are not bare than are across
+    film_after = np.cumsum(~is_bare[::-1])[::-1]
+    runs = np.convolve(is_bare, np.ones(SHORTEST_BARE_PX), mode="full")[SHORTEST_BARE_PX - 1 :] > SHORTEST_BARE_PX - 0.5
+    bare_from = int(np.argmax(runs & (film_after <= strip.values.shape[1])))
+    if bare_from < 3 * SHORTEST_BARE_PX or is_bare[bare_from - 2 * SHORTEST_BARE_PX : bare_from].mean() > 0.3:
+        return passed[1]
+    growth = _speed(arrival, bare_from - 6 * SHORTEST_BARE_PX, bare_from - 5)
+    flight = _speed(arrival, bare_from + 2, len(columns))
+    # An object that comes out is ahead of the film at once by its own length, however slowly it then flies.
+    exit_frame = int(arrival[bare_from])
+    leap = float(np.diff(path)[max(exit_frame - 2, 0) : exit_frame + 2].max(initial=0.0))
+    leaps = leap > max(flight_speed_ratio * growth, growth + SHORTEST_BARE_PX / 2)
+    flies_on = flight > flight_speed_ratio * growth or leaps
+    return int(columns[bare_from]) + 1 if flies_on else passed[1]
+
+
+def _speed(arrival: Indices, first: int, last: int) -> float:
+    """Mean speed between two columns, columns a frame."""
+    first, last = max(first, 0), min(last, len(arrival)) - 1
+    return (last - first) / max(float(arrival[last] - arrival[first]), 0.5)
+
+
+def _mean(strip: Strip, frames: slice, columns: Indices) -> NDArray[np.float32]:
+    """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
+    values = strip.values[frames][:, :, columns].astype(np.float32)
+    level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
+    return np.asarray(level.mean(axis=0), dtype=np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import curve_problem, find_growth_axis
 from vinetrack.video.edge import EdgeTracker
-from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
@@ -47,7 +47,8 @@ class ArrivalTracker:
         width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
         strip = cut_strip(look.luma, look.axis, width_px)
         min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
-        values = strip.brightness()
+        values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
+        values += strip.offset[:, None, None].astype(np.float32)
         first = np.median(values[:END_FRAMES], axis=0)
         # 4.0: change, in units of the noise, that counts (chosen)
         threshold = 4.0 * max(strip.noise, 3.0)
@@ -148,7 +149,7 @@ class Tracking:
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
     strip_frames: Indices | None = None
-    ending: Ending | None = None
+    ending: Ending = field(default_factory=Ending)
 
     @property
     def strip_rows(self) -> Indices:
@@ -199,8 +200,10 @@ def track_pixels(
     random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
-    end_px = strip.axis.length_px - followed.reach_px
-    quality = assess_points(followed.edge_px, total_px, number, unsure=followed.unsure, end_px=end_px)
+    quality = assess_points(
+        followed.edge_px, total_px, number, unsure=followed.unsure,
+        repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
+    )  # fmt: skip
     if quality.last_moving < 0:
         # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
         if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
@@ -260,10 +263,10 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
 def _notes(
     frames: Frames, number: Indices, luma: NDArray[Any], trial: Trial, followed: Positions, quality: PointQuality,
     axis_given: bool,
-) -> tuple[list[str], Ending | None]:  # fmt: skip
+) -> tuple[list[str], Ending]:  # fmt: skip
     """Sentences about the track: its points, its end and its axis; and how it ends."""
     name = frames.recording.path.name
-    notes, ending = [*frames.notes, *quality.notes], None
+    notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
         frame, turns_back = int(number[followed.end[0]]), followed.end[1]
         why = f"is not recognised after frame {frame}: it is gone, hidden or turned over"
@@ -272,7 +275,7 @@ def _notes(
         notes.append(f"{name}: the body {why}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
-        ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
+        ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
     axis = followed.strip.axis
     if axis.bends and not axis_given:
         notes.append(
@@ -342,8 +345,10 @@ def in_metres(
     """A tracking in pixels with hand corrections, positions and errors in metres, times corrected for dropped and
     inserted frames, and notes on its end where that is not the end of the vine. Shapes: position_m (n, 2).
     """
-    of_end = () if tracking.ending is None else tracking.ending.notes(trial.length_m / m_per_px)
-    track = corrected_by_hand(replace(tracking.track, notes=(*tracking.track.notes, *of_end)), trial.corrections)
+    ending, length_px = tracking.ending, trial.length_m / m_per_px
+    notes = [*tracking.track.notes]
+    notes[ending.place : ending.place] = ending.notes(length_px)
+    track = corrected_by_hand(replace(tracking.track, notes=tuple(notes)), trial.corrections)
     position = track.edge_px * m_per_px
     local_m_per_px: Floats | float = m_per_px
     if position_m is not None:
