@@ -68,7 +68,7 @@ class BatchArrays(NamedTuple):
     stops: Floats  #: tail travel at the end of growth, m, shape (n_trials,); infinite if there is none
 
 
-RUNNING, ENDED, STALLED, TOO_HARD, TAUT = np.arange(5)  # Status of a trajectory
+RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
 
 
 class Asked(IntEnum):
