@@ -31,7 +31,7 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import SLOW_NOISE, assemble
+from vinetrack.inference.solving import assemble
 
 # Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
 MIN_SHARE_OF_BEST_GAIN = 0.3
@@ -76,9 +76,6 @@ def full_fit(before: Fit, shape: CandidateShape, size: float, best: float) -> Fi
             goal=goal,
         )
         poor = is_poor_fit(fit.predictor, fit.solution)
-        if fit.noise_correlation > SLOW_NOISE and poor:
-            # Strongly correlated noise absorbs any misfit, and the likelihood says nothing.
-            return None
         if fit.converged or fit.log_likelihood < best - 50.0 or poor:
             return fit
         return refit(fit, most_iterations=40, thorough=False)

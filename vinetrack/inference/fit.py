@@ -56,7 +56,6 @@ from vinetrack.inference.sensitivity import (
 from vinetrack.inference.solving import (
     as_recorded,
     assemble,
-    solve_again,
     solve_from,
     solve_from_scratch,
     solve_onward,
@@ -477,7 +476,7 @@ def fit(
         fixed_terms = FixedTerms(spreads, (rho, np.full(len(data), noise_m**2 * (1 - rho**2))))
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
-    solution = solve_from_scratch(predictor, fixed_terms, watch, thorough=thorough)
+    solution = solve_from_scratch(predictor, fixed_terms, watch, most_iterations=MOST_ITERATIONS if thorough else 25)
     _refuse_a_standstill(predictor, solution)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, watch=watch)
     fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms}, profile=profile)
@@ -602,7 +601,7 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
-    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch, "search": not thorough}
+    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch, "goal": goal}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
@@ -611,7 +610,6 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, **how)
     fitted = assemble(
         predictor,

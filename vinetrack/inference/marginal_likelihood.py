@@ -406,10 +406,10 @@ def bounded_solve(
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
 
-LARGEST_CORRELATION = 0.9998  # Upper bound of the noise correlation, nearly 1 (derived)
+LARGEST_CORRELATION = 0.97
 
 CORRELATIONS = np.concatenate(
-    [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
+    [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, LARGEST_CORRELATION]]
 )
 
 

@@ -241,7 +241,6 @@ def solve(
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
     least_decrease: float = CONVERGED_DECREASE,
-    search: bool = False,
     goal: float = -math.inf,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
@@ -301,10 +300,6 @@ def solve(
         # A fit that is one of many candidates is stopped early where it cannot succeed.
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
         deviances.append(_deviance_of(problem, state, penalised_squares, fixed_terms))
-        if search and _stagnates(deviances, STAGNATION_DECREASE * float(np.sum(problem.points))):
-            reached = Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
-            if is_poor_fit(predictor, reached):
-                break
         if math.isfinite(goal) and iteration > first_iterations:
             part = marginal(cross_products, problem, state)
             shortfall = deviance(part, problem, state, state.spread, restricted=False) + 2 * goal
@@ -379,12 +374,6 @@ def _decrease_per_step(deviances: Sequence[float]) -> float:
     """
     before = deviances[:-PROGRESS_STEPS]
     return (min(before) - min(deviances)) / PROGRESS_STEPS if before else math.inf
-
-
-def _stagnates(deviances: Sequence[float], least: float) -> bool:
-    """Whether the last steps lowered −2 ln L by less than `least`; never right after a jump that raised it."""
-    before, last = deviances[:-PROGRESS_STEPS], deviances[-PROGRESS_STEPS:]
-    return bool(before) and last[-1] == min(last) > min(before) - least
 
 
 def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:

@@ -47,7 +47,6 @@ from vinetrack.inference.optimiser import (
     is_poor_fit,
     make_problem,
     solve,
-    track_correlation,
 )
 from vinetrack.inference.position_errors import (
     Pooled,
@@ -70,7 +69,6 @@ from vinetrack.inference.sensitivity import (
     Predictor,
     align,
     candidates,
-    initial_trial_effects,
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
 
@@ -78,99 +76,20 @@ from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
 CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
 
 
-SLOW_NOISE = 0.99  # Noise correlation above which a fit has absorbed misfit as noise (chosen)
-
-
 def solve_from_scratch(
-    predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
+    predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, most_iterations: int = MOST_ITERATIONS
 ) -> Solution:
-    """Solve from the starting values of least misfit. A poor solution is repeated at the noise correlation of the
-    tracks, and from further starting values where `thorough`.
-    """
+    """Solve from the starting values of least misfit from which the model can be simulated."""
     reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
-    starts = [start[1:] for start in candidates(predictor.layout, predictor.data, predictor)[:3]]
-    most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
-    for theta, trial_effects in starts:
+    for _, theta, trial_effects in candidates(predictor.layout, predictor.data, predictor)[:3]:
         try:
-            free = solve_from(
+            return solve_from(
                 predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch
             )
-            break
         except SimulationError as error:
             reason = str(error)
-    else:
-        raise FitError(f"The model cannot be simulated from any starting values: {reason}")
-    return _less_poor(predictor, free, starts if thorough else starts[:1], fixed_terms, watch)
-
-
-def _less_poor(
-    predictor: Predictor,
-    solution: Solution,
-    starts: Sequence[tuple[Floats, Floats]],
-    fixed_terms: FixedTerms,
-    watch: Watch | None,
-    **how: Any,
-) -> Solution:
-    """The solution, or, if it is poor, the best at track correlation, preferably one that is not poor. A poor solution
-    at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any misfit has a high
-    likelihood. `how` are options of `_solve_at_track_correlation`.
-    """
-    if not is_poor_fit(predictor, solution):
-        return solution
-    found = [_solve_at_track_correlation(predictor, *start, fixed_terms, watch, **how) for start in starts]
-    again = [each for each in found if each is not None]
-    good = [each for each in again if not is_poor_fit(predictor, each)]
-    return min(good or again or [solution], key=lambda each: each.deviance())
-
-
-def _solve_at_track_correlation(
-    predictor: Predictor,
-    theta: Floats,
-    trial_effects: Floats,
-    fixed_terms: FixedTerms,
-    watch: Watch | None,
-    *,
-    then_free: bool = True,
-    goal: float = -math.inf,
-) -> Solution | None:
-    """Solve with the noise correlation fixed at that of the tracks, then, with `then_free`, from there with free noise.
-    Between-trial standard deviations are fixed near zero: a misfit far above the noise would otherwise distort the
-    pressure and B of each trial until n is meaningless.
-    """
-    if fixed_terms.noise is not None:
-        return None
-    # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B while the noise correlation is fixed (chosen)
-    correlation_fixed = FixedTerms(
-        spread=fixed_terms.spread or (5e-4, 1e-3), correlation=track_correlation(predictor.data)
-    )
-    state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
-    try:
-        first = solve(
-            predictor,
-            problem,
-            state,
-            correlation_fixed,
-            warm=True,
-            most_iterations=TRACK_CORRELATION_ITERATIONS,
-            watch=watch,
-            search=not then_free,
-            goal=goal,
-        )
-        if not then_free:
-            return first
-        trial_effects, _ = align(predictor.data, predictor, first.state.theta, initial_trial_effects(predictor.data))
-        free = solve_from(
-            predictor,
-            first.state.theta,
-            trial_effects,
-            fixed_terms,
-            most_iterations=CONTINUATION_ITERATIONS,
-            watch=watch,
-        )
-        return first if is_poor_fit(predictor, free) else free
-    except SimulationError:
-        return None
+    raise FitError(f"The model cannot be simulated from any starting values: {reason}")
 
 
 def solve_from(
@@ -188,7 +107,7 @@ def solve_from(
 
 
 def solve_onward(
-    predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, *, search: bool = False, **how: Any
+    predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
     are options of `solve`. From bad starting values the fit descends with the noise fixed first, since their misfit
@@ -206,28 +125,8 @@ def solve_onward(
         state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
         noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
         steps = TRACK_CORRELATION_ITERATIONS
-        state = solve(predictor, problem, state, noise, warm=True, most_iterations=steps, search=search).state
-    return solve(predictor, problem, state, fixed_terms, warm=True, search=search, **how)
-
-
-def solve_again(
-    predictor: Predictor,
-    solution: Solution,
-    fixed_terms: FixedTerms,
-    watch: Watch | None,
-    *,
-    thorough: bool,
-    goal: float = -math.inf,
-) -> Solution:
-    """The solution, or, if it is poor, one found from its parameters with the noise correlation of the tracks."""
-    if not is_poor_fit(predictor, solution):
-        return solution
-    theta = solution.state.theta
-    try:
-        trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
-    except SimulationError:
-        return solution
-    return _less_poor(predictor, solution, [(theta, trial_effects)], fixed_terms, watch, then_free=thorough, goal=goal)
+        state = solve(predictor, problem, state, noise, warm=True, most_iterations=steps).state
+    return solve(predictor, problem, state, fixed_terms, warm=True, **how)
 
 
 # ------------------------------------------------------------------------------
