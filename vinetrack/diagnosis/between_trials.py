@@ -325,7 +325,7 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
     between = (*before.predictor.layout.between, *difference.terms)
     try:
         # 14, 30: iterations of the fit of a difference, at first and in all (chosen)
-        fit = refit(before, between=between, shared=difference.shared, most_iterations=14, thorough=False)
-        return fit if fit.converged else refit(fit, most_iterations=30, thorough=False)
+        fit = refit(before, between=between, shared=difference.shared, most_iterations=14)
+        return fit if fit.converged else refit(fit, most_iterations=30)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None

@@ -64,7 +64,6 @@ def full_fit(before: Fit, shape: CandidateShape, size: float, best: float) -> Fi
     """Fit a model with an effect added, from a shape at its predicted size; None where the fit fails. `best` is the
     largest ln L of the others: a fit that stays far behind it is given up.
     """
-    goal = before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood)
     try:
         # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
         fit = refit(
@@ -72,13 +71,10 @@ def full_fit(before: Fit, shape: CandidateShape, size: float, best: float) -> Fi
             before.model.with_effects((shape.effect,)),
             start=start_values(shape, size),
             most_iterations=14,
-            thorough=False,
-            goal=goal,
         )
-        poor = is_poor_fit(fit.predictor, fit.solution)
-        if fit.converged or fit.log_likelihood < best - 50.0 or poor:
+        if fit.converged or fit.log_likelihood < best - 50.0 or is_poor_fit(fit.predictor, fit.solution):
             return fit
-        return refit(fit, most_iterations=40, thorough=False)
+        return refit(fit, most_iterations=40)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 

@@ -82,7 +82,7 @@ def initial_fit(
     model: Model, pairs: Pairs, candidates: Iterable[Effect], *, profile: bool = True, free: Iterable[str] = ()
 ) -> Fit:
     """Fit the model in use, as the diagnosis does."""
-    return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile, thorough=False)
+    return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile)
 
 
 # ------------------------------------------------------------------------------

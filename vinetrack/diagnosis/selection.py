@@ -150,7 +150,7 @@ class EffectSets:
 
     def _refitted(self, fit: Fit, effects: Iterable[Effect]) -> Fit | None:
         try:
-            return refit(fit, self.before.model.with_effects(effects), thorough=False)
+            return refit(fit, self.before.model.with_effects(effects))
         except (FitError, SimulationError, np.linalg.LinAlgError):
             return None
 
@@ -419,7 +419,7 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     try:
         slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
-        after = refit(slack, thorough=False, afresh=has_excess_scatter(fit))
+        after = refit(slack, afresh=has_excess_scatter(fit))
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
     return likelihood_ratio(fit, (TAIL_SLACK,), after)

@@ -457,7 +457,6 @@ def fit(
     noise: tuple[float, float] | None = None,
     profile: bool = True,
     host: Model | None = None,
-    thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit a model to all trials of an experiment."""
@@ -476,7 +475,7 @@ def fit(
         fixed_terms = FixedTerms(spreads, (rho, np.full(len(data), noise_m**2 * (1 - rho**2))))
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
-    solution = solve_from_scratch(predictor, fixed_terms, watch, most_iterations=MOST_ITERATIONS if thorough else 25)
+    solution = solve_from_scratch(predictor, fixed_terms, watch)
     _refuse_a_standstill(predictor, solution)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, watch=watch)
     fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms}, profile=profile)
@@ -518,9 +517,7 @@ def refit(
     hold_noise: bool = False,
     profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
-    thorough: bool = True,
     afresh: bool = False,
-    goal: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other parameters of the same model, to the same data, starting from a previous fit.
@@ -544,13 +541,8 @@ def refit(
         Whether intervals near a bound are profile-likelihood intervals.
     most_iterations : int
         Maximum number of steps; a model that only has to be ruled out need not converge.
-    thorough : bool
-        Whether a poor fit, which has absorbed its misfit as slow noise, is repeated at fixed noise correlation and then
-        iterated to convergence with free noise; otherwise only as far as a comparison with other models needs.
     afresh : bool
         Whether release, deviations and noise start from the tracks alone instead of the previous fit.
-    goal : float
-        A poor fit is abandoned as soon as it can no longer reach this ln L.
     watch : callable, optional
         Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
@@ -601,7 +593,7 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
-    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch, "goal": goal}
+    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))

@@ -406,11 +406,9 @@ def bounded_solve(
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
 
-LARGEST_CORRELATION = 0.97
-
-CORRELATIONS = np.concatenate(
-    [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, LARGEST_CORRELATION]]
-)
+# Noise correlations that are tried (chosen). Up to 0.97, which is 30 frames: what stays longer is misfit, and a random
+# walk would take up any. Slow errors of tracks are systematic ones.
+CORRELATIONS = np.concatenate([np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97]])
 
 
 @dataclass(frozen=True)

@@ -174,12 +174,6 @@ CONVERGED_DECREASE = 1e-2  # Predicted decrease of −2 ln L per step below whic
 CONVERGED_VARIANCES = 0.02
 
 
-PROGRESS_STEPS = 4  # Steps over which progress is measured before a fit is stopped early (chosen)
-
-# Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped (derived)
-STAGNATION_DECREASE = 2e-3
-
-
 @dataclass(frozen=True)
 class FixedTerms:
     """Variance components that are fixed instead of estimated. `spread` are the between-trial standard deviations of
@@ -188,7 +182,6 @@ class FixedTerms:
 
     spread: tuple[float, float] | None = None
     noise: tuple[float, Floats] | None = None
-    correlation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -241,12 +234,10 @@ def solve(
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
     least_decrease: float = CONVERGED_DECREASE,
-    goal: float = -math.inf,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
-    Levenberg–Marquardt damping where a full step fails. A fit that can no longer reach the ln L of a `goal` is
-    abandoned. Shapes: columns (n_points, 4 + n_keys + 1).
+    Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
     """
     # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
     first_iterations, most_first_iterations, far_from_optimum = 3, 9, 1e3
@@ -262,7 +253,6 @@ def solve(
     # step falls below the first number, or after this many steps (along the valley between two releases
     # Gauss–Newton steps become tiny); and how many of these searches may move a release (chosen)
     searches_left, last_search, searched_in_vain = 8, 0, False
-    deviances: list[float] = []
     releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
         close = predicted_decrease < far_from_optimum or iteration > most_first_iterations
@@ -297,15 +287,7 @@ def solve(
         if small_step and variances_moved < CONVERGED_VARIANCES and not first_phase:
             converged = True
             break
-        # A fit that is one of many candidates is stopped early where it cannot succeed.
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
-        deviances.append(_deviance_of(problem, state, penalised_squares, fixed_terms))
-        if math.isfinite(goal) and iteration > first_iterations:
-            part = marginal(cross_products, problem, state)
-            shortfall = deviance(part, problem, state, state.spread, restricted=False) + 2 * goal
-            expected_later = (most_iterations - iteration) * _decrease_per_step(deviances)
-            if shortfall > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_later:
-                break
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
         accepted, damping = _accepted_step(
             predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
@@ -347,33 +329,7 @@ def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:
         state = replace(state, spread=fixed_terms.spread)
     if fixed_terms.noise is not None:
         state = replace(state, rho=fixed_terms.noise[0], variance=fixed_terms.noise[1])
-    if fixed_terms.correlation is not None:
-        state = replace(state, rho=fixed_terms.correlation)
     return state
-
-
-def _deviance_of(problem: MixedProblem, state: FitState, penalised_squares: float, fixed_terms: FixedTerms) -> float:
-    """−2 ln L up to a constant; where the noise is fixed, with the variance profiled out instead."""
-    if fixed_terms.noise is not None:
-        return float(np.sum(problem.points)) * math.log(max(penalised_squares, 1e-300))
-    return penalised_squares + float(np.sum(problem.points * np.log(state.variance)))
-
-
-def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted_decrease: float) -> float:
-    """Largest decrease of −2 ln L by this step: the predicted decrease, followed by a new estimate of the noise. With n
-    points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares except the
-    noise itself.
-    """
-    remaining = 1 - predicted_decrease / max(penalised_squares, 1e-300)
-    return -float(np.sum(problem.points)) * math.log(remaining) if remaining > 0 else math.inf
-
-
-def _decrease_per_step(deviances: Sequence[float]) -> float:
-    """Mean decrease of the lowest −2 ln L over the last PROGRESS_STEPS steps; infinite if there are too few steps.
-    Single values may go up and down, as noise and parameters are estimated in turn.
-    """
-    before = deviances[:-PROGRESS_STEPS]
-    return (min(before) - min(deviances)) / PROGRESS_STEPS if before else math.inf
 
 
 def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
@@ -391,16 +347,10 @@ def update_variances(
     fixed_terms: FixedTerms,
     *,
     first_phase: bool = False,
-    largest_rho: float = math.inf,
 ) -> FitState:
-    """Estimate noise, up to a largest correlation, and between-trial standard deviations; in the first phase only the
-    size of the noise.
-    """
+    """Estimate noise and between-trial standard deviations; in the first phase only the size of the noise."""
     if fixed_terms.noise is None:
-        fixed_rho = state.rho if first_phase or fixed_terms.correlation is not None else None
-        rho, variance = estimate_noise(cross_products, problem, state, fixed_rho)
-        if rho > largest_rho:
-            rho, variance = estimate_noise(cross_products, problem, state, largest_rho)
+        rho, variance = estimate_noise(cross_products, problem, state, state.rho if first_phase else None)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
     if not first_phase and any(estimable_sd):
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)

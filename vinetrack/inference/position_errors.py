@@ -354,9 +354,7 @@ def _newton_on_fixed_columns(
     total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
 
     def with_variances(products: Floats, state: FitState) -> FitState:
-        # Noise of correlation near 1 would make anything likely.
-        largest_rho = solution.state.rho
-        return update_variances(predictor, problem, products, state, solution.estimable, held, largest_rho=largest_rho)
+        return update_variances(predictor, problem, products, state, solution.estimable, held)
 
     state = with_variances(cross_products, state)
     level = log_likelihood(cross_products, problem, state, solution.estimable)

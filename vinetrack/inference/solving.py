@@ -1,9 +1,4 @@
-"""Solve for the parameters; where the solution is poor, again with the noise correlation of the tracks.
-
-A fit estimates the noise together with its parameters. From poor starting values it may absorb the whole misfit as slow
-noise: the likelihood is then high and the parameters are wrong. `is_poor_fit` recognises such a solution by its
-residual relative to the growth; the fit is then repeated with the noise correlation fixed at that of the tracks.
-"""
+"""Solve for the parameters of a model from starting values or onward from another fit, and assemble what is stated."""
 
 from __future__ import annotations
 
@@ -37,7 +32,6 @@ from vinetrack.inference.marginal_likelihood import (
     with_diagonal,
 )
 from vinetrack.inference.optimiser import (
-    MOST_ITERATIONS,
     FixedTerms,
     Solution,
     Watch,
@@ -72,21 +66,14 @@ from vinetrack.inference.sensitivity import (
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
 
-# Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
-CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
 
-
-def solve_from_scratch(
-    predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, most_iterations: int = MOST_ITERATIONS
-) -> Solution:
+def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None) -> Solution:
     """Solve from the starting values of least misfit from which the model can be simulated."""
     reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
     for _, theta, trial_effects in candidates(predictor.layout, predictor.data, predictor)[:3]:
         try:
-            return solve_from(
-                predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch
-            )
+            return solve_from(predictor, theta, trial_effects, fixed_terms, watch=watch)
         except SimulationError as error:
             reason = str(error)
     raise FitError(f"The model cannot be simulated from any starting values: {reason}")
@@ -124,8 +111,8 @@ def solve_onward(
         here, there = (trial_costs(predictor, problem, each) for each in (state, replace(state, trial_effects=aligned)))
         state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
         noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
-        steps = TRACK_CORRELATION_ITERATIONS
-        state = solve(predictor, problem, state, noise, warm=True, most_iterations=steps).state
+        # 40: steps at fixed noise, at most (chosen)
+        state = solve(predictor, problem, state, noise, warm=True, most_iterations=40).state
     return solve(predictor, problem, state, fixed_terms, warm=True, **how)
 
 

@@ -348,7 +348,7 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
     run_fit = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
-    result = run_fit(thorough=False)
+    result = run_fit()
     if not result.log_likelihood > campaign.stored.log_likelihood - CLEARLY_WORSE:
         result = run_fit()
     return _evaluated(campaign, choice, result)
