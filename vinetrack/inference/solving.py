@@ -25,6 +25,8 @@ from vinetrack.inference.fit_result import (
 )
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
+    FitState,
+    MixedProblem,
     levenberg_marquardt_step,
     solve_per_trial,
     trial_effect_prior,
@@ -90,7 +92,23 @@ def solve_from(
     `how` are options of `solve`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
     state = first_state(predictor.data, theta, trial_effects)
-    return solve(predictor, make_problem(predictor, trial_effects), state, fixed_terms, **how)
+    return _solve_or_alike(predictor, make_problem(predictor, trial_effects), state, fixed_terms, **how)
+
+
+def _solve_or_alike(
+    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, **how: Any
+) -> Solution:
+    """Solve, and where the fit is poor, once more with trials that are alike: differences between them in pressure and
+    B take up what a model lacks, and n is meaningless then. If that leads near the tracks, trials may differ again.
+    """
+    solution = solve(predictor, problem, state, fixed_terms, **how)
+    if fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
+        return solution
+    # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
+    alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
+    if is_poor_fit(predictor, alike):
+        return alike
+    return solve(predictor, problem, alike.state, fixed_terms, **{**how, "warm": True})
 
 
 def solve_onward(
@@ -113,7 +131,7 @@ def solve_onward(
         noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
         # 40: steps at fixed noise, at most (chosen)
         state = solve(predictor, problem, state, noise, warm=True, most_iterations=40).state
-    return solve(predictor, problem, state, fixed_terms, warm=True, **how)
+    return _solve_or_alike(predictor, problem, state, fixed_terms, warm=True, **how)
 
 
 # ------------------------------------------------------------------------------
