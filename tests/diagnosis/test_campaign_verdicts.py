@@ -39,7 +39,7 @@ from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import variance_floor
-from vinetrack.inference.robust_covariance import FILM_ERROR
+from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign
 from vinetrack.tracks.importers import flag_end_of_motion

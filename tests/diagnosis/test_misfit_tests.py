@@ -21,7 +21,7 @@ from vinetrack.diagnosis import score_test as score_test
 from vinetrack.diagnosis.selection import slack_fit
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference import robust_covariance
+from vinetrack.inference import systematics
 from vinetrack.inference.optimiser import relative_residual
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 from vinetrack.tracks.position_noise import ar1_noise
@@ -60,8 +60,8 @@ def seen_crookedly() -> Pairs:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
-    def none(predictor, solution, sources) -> robust_covariance.Systematics:  # noqa: ARG001
-        return robust_covariance.systematics_of(predictor, solution, ())
+    def none(predictor, solution, sources) -> systematics.Systematics:  # noqa: ARG001
+        return systematics.systematics_of(predictor, solution, ())
 
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model

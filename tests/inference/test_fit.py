@@ -23,8 +23,8 @@ from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
 
 
@@ -222,11 +222,12 @@ def test_trials_without_usable_motion_are_left_out_and_named(campaign):
 
 
 def test_watch_is_called_with_every_step_and_may_end_the_fit():
-    pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in small_campaign(seed=31)[0]]
-    watch = Mock()
+    pairs, watch = small_campaign(seed=31)[0], Mock()
     found, last = vt.fit(vt.base_model(), pairs, watch=watch), watch.call_args.args[0]
     assert last.iteration == found.iterations
-    assert last.values == pytest.approx({number.name: number.value for number in found.numbers}, rel=1e-6)
+    reached = found.predictor.layout.values(found.solution.state.theta)
+    assert list(last.values) == [number.name for number in found.numbers]
+    assert list(last.values.values()) == pytest.approx(reached.tolist(), rel=1e-6)
     assert last.predicted_decrease < 1e-2
     with pytest.raises(TimeoutError):
         vt.refit(found, watch=Mock(side_effect=TimeoutError))

@@ -27,8 +27,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     gain_p_value,
     likelihood_ratio,
     linear_gain,
-    with_shared_errors,
-    with_trace_errors,
 )
 from vinetrack.diagnosis.result import (
     BETWEEN,
@@ -44,7 +42,7 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.position_errors import with_smooth_errors
+from vinetrack.inference.position_errors import with_systematics
 
 # ------------------------------------------------------------------------------
 # Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.
@@ -236,19 +234,15 @@ PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
 
 MIN_LINEAR_GAIN = 2.0  # Predicted fall of −2 ln L below which a difference is not fitted (chosen)
 
-# p-value below which a difference is also tested with shared systematic errors in the model (chosen)
-SYSTEMATICS_CHECK_P_VALUE = 0.01
-
 
 def differences(fit: Fit) -> list[Difference]:
     """Hypotheses that trials differ, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
         return []
-    plain = with_smooth_errors(fit)
-    base = with_trace_errors(fit, plain)
+    base = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
     best: dict[str, Difference] = {}
     for difference in forms_of(fit, base):
-        estimated = _estimated(fit, plain, base, difference)
+        estimated = _estimated(fit, base, difference)
         if estimated is not None and (
             difference.name not in best or estimated.penalised_gain > best[difference.name].penalised_gain
         ):
@@ -308,15 +302,12 @@ def _effect_of(difference: Difference) -> Effect:
     )
 
 
-def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference) -> Difference | None:
+def _estimated(fit: Fit, base: Solution, difference: Difference) -> Difference | None:
     """The difference with its predicted gain and p-value; None where the gain is not finite."""
     gain = linear_gain(fit, base, difference)
     if not math.isfinite(gain):
         return None
     p = gain_p_value(fit, difference, gain)
-    if p < SYSTEMATICS_CHECK_P_VALUE and difference.stated and difference.confounded:
-        gain_with_errors = linear_gain(fit, with_shared_errors(fit, plain), difference)
-        p = max(p, gain_p_value(fit, difference, gain_with_errors))
     return replace(difference, gain=gain, p=min(p * difference.n_forms, 1.0))
 
 

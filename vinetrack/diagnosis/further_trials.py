@@ -32,7 +32,7 @@ from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, at_unknowns, solve_per_trial
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.position_errors import with_systematics
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.candidate_trials import (
@@ -380,10 +380,10 @@ def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
         solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
         solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
         # These absorb part of what is wrong in a hypothesis, as in every fit.
-        smooth = smooth_errors(predictor, solution)
+        gain = with_systematics(predictor, solution).gain
     except SimulationError:
         return math.nan
-    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
+    return -2 * (solution.log_likelihood() + gain)
 
 
 # ------------------------------------------------------------------------------
@@ -405,7 +405,7 @@ def further_trials(
     plan = FurtherTrials(now, value, target, before, before)
     if before >= target:
         return plan
-    fit = replace(tests.fit, solution=replace(tests.fit.solution, state=tests.fit.state), smooth=None)
+    fit = replace(tests.fit, solution=replace(tests.fit.solution, state=tests.fit.state), with_errors=None)
     films = filmed([fit], feasible_conditions(trials, limits))
     if not films:
         return plan

@@ -39,7 +39,6 @@ from vinetrack.inference.fit import fit, fit_subset, predict_prepared, prepared_
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import as_recorded
 from vinetrack.kinematics.summary import lead_velocity_at
 from vinetrack.kinematics.velocity import estimate_kinematics
 
@@ -337,7 +336,7 @@ def excess(rms_m: float, floor_m: float) -> float:
 
 def in_sample(fit: Fit) -> Errors:
     """Predictions of the trials that the model was fitted to."""
-    return _predicted(fit, [as_recorded(trial_data) for trial_data in fit.predictor.data])
+    return _predicted(fit, fit.predictor.data)
 
 
 def left_out(fit: Fit) -> Errors:
@@ -361,7 +360,7 @@ def highest_pressure(fit: Fit) -> Errors:
 
 def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials left out (`gone`) by the model fitted to the others."""
-    data = [as_recorded(trial_data) for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
+    data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         others = fit_subset(
             fit,

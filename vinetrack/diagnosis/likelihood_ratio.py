@@ -25,15 +25,10 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
 )
 from vinetrack.inference.optimiser import Solution, is_poor_fit
-from vinetrack.inference.position_errors import with_shapes, with_smooth_errors
-from vinetrack.inference.robust_covariance import (
-    FEWEST_CLUSTERS,
-    SOURCES,
-    Systematics,
-    robust_covariance,
-    systematics_of,
-)
+from vinetrack.inference.position_errors import with_systematics
+from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
+from vinetrack.inference.systematics import systematics_of, with_unknowns
 
 # ------------------------------------------------------------------------------
 # Likelihood gain of a difference between trials, from the linear mixed model of a fit, without simulations.
@@ -95,33 +90,6 @@ def _deviance(solution: Solution, base: Solution, spread: tuple[float, float] | 
     return deviance(part, problem, state, spread, restricted=False)
 
 
-def with_shared_errors(fit: Fit, base: Solution) -> Solution:
-    """Add the shared systematic errors of payloads, set pressures and trackers to a solution as nuisance parameters.
-    They are common to all replicates of a condition. With enough replicates they exceed the scatter of trials, and
-    would pass for a difference between groups of conditions.
-    """
-    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, SOURCES[:-1]))
-
-
-def with_trace_errors(fit: Fit, base: Solution) -> Solution:
-    """Add the errors of recorded pressures to a solution as parameters, with the corrections of its fit undone."""
-    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, ["gauge"]))
-
-
-def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
-    """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1."""
-    if not errors.count:
-        return base
-    columns, problem = errors.added_to(base.columns, base.problem)
-    return replace(
-        base,
-        state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
-        problem=problem,
-        cross_products=fit.predictor.products(columns),
-        columns=tuple(columns),
-    )
-
-
 def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
     """A solution with the coefficients of a difference added, all zero. Each is a multiple of a column that the
     solution has: that of a trial's deviation, or of a parameter that vines shared.
@@ -145,7 +113,7 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
         for begin, names, of_trials in zip(first[:-1], members, groups, strict=True)
     ]
     precision = np.repeat(precisions, [len(names) for names in members])
-    problem = with_shapes(base.problem, precision.size, precision)
+    problem = with_unknowns(base.problem, precision.size, precision)
     problem = replace(
         problem,
         index=np.column_stack([base.problem.index, *places]),
@@ -180,8 +148,15 @@ def film_gain(fit: Fit) -> float:
     errors = systematics_of(fit.predictor, fit.solution, ["film"])
     if not errors.count:
         return 0.0
-    base = with_smooth_errors(fit)
-    return max(_deviance(base, base) - _deviance(with_errors(fit, base, errors), base), 0.0)
+    base = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
+    columns = errors.beside(base.columns)
+    with_film = replace(
+        base,
+        state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
+        problem=errors.among(base.problem),
+        cross_products=fit.predictor.products(columns),
+    )
+    return max(_deviance(base, base) - _deviance(with_film, base), 0.0)
 
 
 # ------------------------------------------------------------------------------

@@ -44,8 +44,9 @@ from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
-from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, systematics_of
+from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
+from vinetrack.inference.systematics import systematics_of
 from vinetrack.planning.candidate_trials import at_solution
 
 # ------------------------------------------------------------------------------
@@ -65,7 +66,7 @@ def noiseless_start(fit: Fit) -> Fit:
     state, predictor = replace(fit.state, trial_effects=trial_effects), _predictor_of(fit, fit.predictor.data)
     columns = tuple(predictor.linearise(state.theta, trial_effects))
     solution = replace(fit.solution, state=state, columns=columns)
-    return replace(fit, predictor=predictor, solution=solution, smooth=None)
+    return replace(fit, predictor=predictor, solution=solution, with_errors=None)
 
 
 def _predictor_of(fit: Fit, data: Sequence[FitTrial]) -> Predictor:

@@ -34,13 +34,8 @@ from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit, relative_residual, variance_floor
-from vinetrack.inference.robust_covariance import (
-    FEWEST_CLUSTERS,
-    SOURCES,
-    Systematics,
-    cluster_variance,
-    systematics_of,
-)
+from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, cluster_variance
+from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.

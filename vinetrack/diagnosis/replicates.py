@@ -37,7 +37,6 @@ from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
-from vinetrack.inference.solving import as_recorded
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 from vinetrack.tracks.position_noise import rest_points
 
@@ -357,7 +356,7 @@ class ResidualCourse:
 
 def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit]]:
     """Courses of the trials of a fit, and the trials as predicted with their own release and origin."""
-    predicted = predict_prepared(fit, list(map(as_recorded, fit.predictor.data)), from_rest=True)
+    predicted = predict_prepared(fit, fit.predictor.data, from_rest=True)
     aligned = align_trials(fit)
     return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted
 

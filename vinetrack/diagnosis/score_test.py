@@ -37,8 +37,9 @@ from vinetrack.inference.marginal_likelihood import (
     summed,
     trial_effects_eliminated,
 )
-from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
+from vinetrack.inference.robust_covariance import cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import position_change
+from vinetrack.inference.systematics import Systematics
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
@@ -377,7 +378,7 @@ def products_of(fit: Fit, sensitivities: EffectSensitivities, systematics: Syste
     """Assemble the columns of a fit, of its systematic errors and of the candidates. Afterwards the columns of
     `sensitivities` are views of those made here, so that no trial's are held twice.
     """
-    of_fit, problem = systematics.added_to(fit.solution.columns, fit.solution.problem)
+    of_fit, problem = systematics.beside(fit.solution.columns), systematics.among(fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):
         assembled.append(np.column_stack([columns_of_trial, sensitivities.columns[i]]))

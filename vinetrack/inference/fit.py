@@ -42,8 +42,7 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.position_errors import Pooled, pool, position_shapes, student, trial_information
-from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
+from vinetrack.inference.position_errors import Pooled, pool, student, trial_information
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -54,14 +53,13 @@ from vinetrack.inference.sensitivity import (
     initial_trial_effects,
 )
 from vinetrack.inference.solving import (
-    as_recorded,
     assemble,
     solve_from,
     solve_from_scratch,
     solve_onward,
     trial_fit,
-    with_fitted_trace_errors,
 )
+from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 from vinetrack.inference.trial_effects import subset
 
 if TYPE_CHECKING:
@@ -477,7 +475,6 @@ def fit(
     predictor = Predictor(layout, data, host)
     solution = solve_from_scratch(predictor, fixed_terms, watch)
     _refuse_a_standstill(predictor, solution)
-    predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, watch=watch)
     fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms}, profile=profile)
     return replace(fitted, pairs=tuple(pairs))
 
@@ -566,8 +563,7 @@ def refit(
     model = model or before.model
     fitted_values = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**fitted_values, **(start or {})})
-    # Corrections of recorded pressures that belong to another model would bias this one towards it.
-    data = before.predictor.data if model.names == before.model.names else list(map(as_recorded, before.predictor.data))
+    data = before.predictor.data
     names = {*model.parameter_names, "yield_pressure.P_y"}
     options_used = {
         key: tuple(name for name in before.options[key] if _names_parameter(name, names))
@@ -602,7 +598,6 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, **how)
     fitted = assemble(
         predictor,
         solution,

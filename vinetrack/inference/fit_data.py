@@ -74,7 +74,6 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     trace_errors_Pa: Floats | None = None
-    trace_error_sizes: Floats | None = None
     imprecise_rest: ImpreciseRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
     stated_m: Floats | None = None

@@ -490,18 +490,18 @@ class Fit(NumberTable):
     options: Mapping[str, Any]
     pairs: tuple[tuple[Trial, Track], ...] = ()
     between: Floats | None = None
-    smooth: FitState | None = None
+    with_errors: FitState | None = None
 
     @property
     def state(self) -> FitState:
-        """State of the solution, with the variance components of the fit that includes smooth errors of position. The
-        iterations are without smooth errors, so that the displacement by a lens is taken for deviations of single
+        """State of the solution, with the variance components of the fit that includes the systematic errors. The
+        iterations are without them, so that the displacement by a lens is taken for deviations of single
         trials and enlarges noise and standard deviations.
         """
-        state, smooth = self.solution.state, self.smooth
-        if smooth is None:
+        state, with_errors = self.solution.state, self.with_errors
+        if with_errors is None:
             return state
-        return replace(state, spread=smooth.spread, rho=smooth.rho, variance=smooth.variance)
+        return replace(state, spread=with_errors.spread, rho=with_errors.rho, variance=with_errors.variance)
 
     def trial(self, name: str) -> TrialFit:
         """The trial of that name; KeyError where there is none."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -28,8 +28,9 @@ from vinetrack.inference.fit_result import (
     TrialEstimates,
     numbers_text,
 )
-from vinetrack.inference.position_errors import with_smooth_errors
-from vinetrack.inference.robust_covariance import FILM_ERROR, moved_by, robust_covariance, systematics_of
+from vinetrack.inference.position_errors import trial_information, with_systematics
+from vinetrack.inference.robust_covariance import robust_covariance
+from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 
 # ------------------------------------------------------------------------------
 # Sensitivity of fitted numbers to the mass of the film.
@@ -64,9 +65,12 @@ def film_influence(fit: Fit) -> Floats:
     """
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
-    errors, solution = systematics_of(fit.predictor, fit.solution, ["film"]), with_smooth_errors(fit)
+    errors = systematics_of(fit.predictor, fit.solution, ["film"])
+    solution = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
     plain = robust_covariance(fit.predictor, solution)[0]
-    moved = moved_by(fit.predictor, solution, errors, plain)[: len(fit.numbers)]
+    products = fit.predictor.products(errors.beside(solution.columns))
+    both = replace(solution, problem=errors.among(solution.problem), cross_products=products)
+    moved = (plain @ trial_information(both)[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)

@@ -1,13 +1,7 @@
-"""Smooth errors of position that all trials of a camera share, as nuisance parameters of a fit.
+"""Errors of fitted parameters: precision of a fit with its systematic errors, profile intervals, pooling of few trials.
 
-An uncalibrated lens displaces the leading edge by a smooth function of its position. That function is the same in every
-trial, so neither replicates nor the scatter of trials reveal it, and an effect that resembles it would absorb it. It is
-modelled by Legendre polynomials of order 1 to 4 over the growth, each minus its value where the edge rests and with a
-normal prior of standard deviation σ_s (`position_systematic_mm`).
-
-About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1) and D_i the shapes times σ_s. With s among the free
-parameters this is the linear mixed model of `vinetrack.inference.marginal_likelihood` with four more columns and
-priors. Its likelihood compares hypotheses without crediting any of them with what a lens could explain.
+The systematic errors (`vinetrack.inference.systematics`) are parameters of the linearised fit, each with its prior. Its
+likelihood compares hypotheses without crediting any of them with what such an error could explain.
 """
 
 from __future__ import annotations
@@ -15,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,11 +43,8 @@ from vinetrack.inference.optimiser import (
     variance_change,
     variance_floor,
 )
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
-
-if TYPE_CHECKING:
-    from vinetrack.inference.fit_result import Fit
-
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
+from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
 # Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
@@ -257,67 +247,45 @@ def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
 
 
 @dataclass(frozen=True)
-class SmoothErrors:
-    """A fit with smooth errors of position included. `solution` holds the free parameters of the fit and after them the
-    sizes of the errors in prior standard deviations.
+class WithSystematics:
+    """A fit with its systematic errors included. `solution` holds the free parameters of the fit and after them the
+    sizes of the errors in prior standard deviations, and `sources` where each of these comes from. `gain` of ln L is
+    that over the fit as it is.
     """
 
     solution: Solution
+    sources: Sequence[str]
     gain: float
     whitened: tuple[Floats, ...]
 
 
-def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
-    """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
-    trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
-    """
-    orders = (1, 2, 3, 4)  # Legendre orders of the shapes
-    sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
-    if not (sigma_m > 0).any():
-        return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
-    # Without any growth the shapes are zero, since their value at rest is subtracted.
-    # 1e-9: growth that counts as none (derived)
-    reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
-    select = np.eye(max(orders) + 1)[list(orders)].T
-    # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
-    at_rest = (-1.0) ** np.array(orders)
-    return [
-        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
-        for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
-    ]
-
-
-def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
-    """Fit the smooth errors of position along with the parameters of a fit, to first order; None where
-    there are none.
-    """
-    shapes = position_shapes(predictor, grown_in(predictor, solution))
-    count = shapes[0].shape[1]
-    if not count:
-        return None
-    extended = _with_shapes(solution.columns, shapes, np.zeros(count))
+def with_systematics(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> WithSystematics:
+    """Fit the systematic errors along with the parameters of a fit, to first order."""
+    errors = systematics_of(predictor, solution)
+    extended = errors.beside(solution.columns)
     held = held or FixedTerms()
     fixed_insensitive = replace(solution.problem, free=solution.problem.free & _sensitive(solution))
-    problem = with_shapes(fixed_insensitive, count)
-    start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
+    problem = errors.among(fixed_insensitive)
+    start = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(errors.count)))
     state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start, held)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
-    # shapes, so it is subtracted.
-    without_shapes = _newton_on_fixed_columns(
+    # errors, so it is subtracted.
+    without_errors = _newton_on_fixed_columns(
         predictor, solution, solution.columns, fixed_insensitive, solution.state, held
     )[3]
     residuals = [values[:, -1] - values[:, :-1] @ change for values, change in zip(extended, moved, strict=True)]
-    return SmoothErrors(
+    return WithSystematics(
         solution=replace(
             solution,
             state=state,
-            problem=with_shapes(solution.problem, count),
+            problem=errors.among(solution.problem),
             cross_products=cross_products,
             columns=tuple(
                 np.column_stack([block[:, :-1], left]) for block, left in zip(extended, residuals, strict=True)
             ),
         ),
-        gain=max(level - without_shapes, 0.0),
+        sources=errors.sources,
+        gain=level - without_errors,
         whitened=tuple(
             whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
             for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
@@ -373,23 +341,6 @@ def _newton_on_fixed_columns(
     return state, cross_products, total_change, level
 
 
-def with_shapes(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
-    """The problem with the sizes of the shapes as further free parameters, each with a normal prior of mean 0."""
-    places = problem.prior_mean.size + np.arange(count)
-    # A column that belongs to no free parameter has index −1, the appended zero.
-    index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
-    return replace(
-        problem,
-        index=index,
-        prior_mean=np.append(problem.prior_mean, np.zeros(count)),
-        prior_precision=np.append(problem.prior_precision, np.full(count, prior_precision)),
-        lower=np.append(problem.lower, np.full(count, -np.inf)),
-        upper=np.append(problem.upper, np.full(count, np.inf)),
-        free=np.append(problem.free, np.ones(count, dtype=bool)),
-        random=np.append(problem.random, np.zeros(count, dtype=bool)),
-    )
-
-
 def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
     """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1). The residual
     becomes r − C·change, the other columns stay.
@@ -397,12 +348,6 @@ def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
     transformation = np.tile(np.eye(cross_products.shape[-1]), (len(cross_products), 1, 1))
     transformation[:, :-1, -1] = -change
     return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
-
-
-def with_smooth_errors(fit: Fit) -> Solution:
-    """The solution of a fit, with the smooth errors of position among its parameters where there are any."""
-    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
-    return smooth.solution if smooth else fit.solution
 
 
 # ------------------------------------------------------------------------------
@@ -421,7 +366,7 @@ def with_smooth_errors(fit: Fit) -> Solution:
 @dataclass(frozen=True)
 class Pooled:
     """Shared parameters with trials weighted by noise and disagreement, scaled. `solution` is the state at these
-    parameters, with the smooth errors of position as further ones.
+    parameters, with the systematic errors as further ones.
     """
 
     solution: Solution
@@ -435,15 +380,14 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     """Estimate the shared parameters with trials weighted by noise and disagreement."""
     if len(predictor.data) < 2:
         return None
-    shapes = position_shapes(predictor, grown_in(predictor, solution))
-    count = shapes[0].shape[1]
-    problem = with_shapes(solution.problem, count) if count else solution.problem
-    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
+    errors = systematics_of(predictor, solution)
+    problem = errors.among(solution.problem)
+    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(errors.count)))
     columns: Sequence[Floats] = solution.columns
     # 12, 0.05: maximum number of steps, and the length of a step in standard errors at which they have converged
     # (chosen)
     for _ in range(12):
-        extended = _with_shapes(columns, shapes, state.theta[shared:])
+        extended = errors.beside(columns, state.theta[shared:])
         cross_products = predictor.products(extended)
         rho, variance = estimate_noise(cross_products, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
@@ -455,8 +399,8 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         step = pooled.covariance @ (pooled.scores.sum(axis=0) - pull)
         scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
-        errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
-        if float(np.max(np.abs(step) / errors, initial=0.0)) < 0.05:
+        sigma = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
+        if float(np.max(np.abs(step) / sigma, initial=0.0)) < 0.05:
             return pooled
         # 3.0: longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
         step = step * min(1.0, 3.0 / longest)
@@ -470,23 +414,6 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         except SimulationError:
             return None
     return None
-
-
-def grown_in(predictor: Predictor, solution: Solution) -> list[Floats]:
-    """Growth of each trial by a fit, m, shape (n_points,)."""
-    return [
-        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
-        for trial_data, trial_effects, columns in zip(
-            predictor.data, solution.state.trial_effects, solution.columns, strict=True
-        )
-    ]
-
-
-def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:
-    return [
-        np.column_stack([block[:, :-1], shape, block[:, -1] - shape @ sizes])
-        for block, shape in zip(columns, shapes, strict=True)
-    ]
 
 
 def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:

@@ -27,7 +27,6 @@ from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
-    levenberg_marquardt_step,
     solve_per_trial,
     trial_effect_prior,
     whitened_products,
@@ -47,15 +46,15 @@ from vinetrack.inference.optimiser import (
 from vinetrack.inference.position_errors import (
     Pooled,
     Precision,
-    SmoothErrors,
+    WithSystematics,
     near_bound,
     pool,
     precision,
     profile_interval,
-    smooth_errors,
     student,
+    with_systematics,
 )
-from vinetrack.inference.robust_covariance import systematics_of, too_few_clusters, widened_covariance
+from vinetrack.inference.robust_covariance import too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -132,94 +131,6 @@ def solve_onward(
         # 40: steps at fixed noise, at most (chosen)
         state = solve(predictor, problem, state, noise, warm=True, most_iterations=40).state
     return _solve_or_alike(predictor, problem, state, fixed_terms, warm=True, **how)
-
-
-# ------------------------------------------------------------------------------
-# Errors that gauge noise leaves in a recorded pressure, estimated as random effects along with a fit.
-#
-# The remaining errors of a curve through noisy readings are known, one standard deviation each
-# (`gauge_noise.DenoisedTrace.errors_Pa`). A light vine follows its pressure immediately, so that an error of the
-# curve moves it by several times the noise of its positions and would look like a difference between trials. So the
-# sizes of these errors, a ~ N(0, 1) in each trial, are random effects besides those of
-# `vinetrack.inference.marginal_likelihood`. The linearised model estimates them with the parameters and trial effects
-# all free at once; they are added to the trace, and the model is fitted again, until they converge. −2 ln L is
-# evaluated at the most likely a, with Σ a² for their prior.
-
-MOST_ROUNDS = 4  # Maximum number of rounds (measured)
-
-
-def with_fitted_trace_errors(
-    predictor: Predictor, solution: Solution, held: FixedTerms, **how: Any
-) -> tuple[Predictor, Solution]:
-    """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures. A
-    poor model would distort the pressures: its trials keep the recorded ones. `how` are options of `solve`.
-    """
-    if not any(_has_errors(trial_data) for trial_data in predictor.data):
-        return predictor, solution
-    for _ in range(MOST_ROUNDS):
-        if is_poor_fit(predictor, solution):
-            break
-        step = trace_error_step(predictor, solution)
-        # 0.1: standard deviations of a step of the errors at which they have converged (chosen)
-        if not np.max(np.abs(step), initial=0.0) > 0.1:
-            break
-        corrected = [_corrected(trial_data, more) for trial_data, more in zip(predictor.data, step, strict=True)]
-        corrected_predictor = Predictor(predictor.layout, corrected, predictor.host)
-        try:
-            solution = solve_onward(corrected_predictor, solution, solution.state.theta, held, **how)
-        except SimulationError:
-            break
-        predictor = corrected_predictor
-    return predictor, solution
-
-
-def trace_error_penalty(data: Sequence[FitTrial]) -> float:
-    """Contribution of the priors of the estimated errors to −2 ln L."""
-    return sum(
-        float(np.sum(trial_data.trace_error_sizes**2))
-        for trial_data in data
-        if trial_data.trace_error_sizes is not None
-    )
-
-
-def as_recorded(trial_data: FitTrial) -> FitTrial:
-    """A trial with its pressure as recorded, without the correction by a fit."""
-    if trial_data.trace_error_sizes is None:
-        return trial_data
-    return replace(_corrected(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
-
-
-def _has_errors(trial_data: FitTrial) -> bool:
-    """Whether the trial has a recorded pressure whose errors can be estimated."""
-    return trial_data.trace is not None and trial_data.trace_errors_Pa is not None
-
-
-def _corrected(trial_data: FitTrial, step: Floats) -> FitTrial:
-    """A trial with its recorded pressure changed by so many standard deviations of each of its errors."""
-    if not _has_errors(trial_data):
-        return trial_data
-    assert trial_data.trace is not None
-    assert trial_data.trace_errors_Pa is not None
-    clock_s, pressure_Pa = trial_data.trace
-    errors_Pa = trial_data.trace_errors_Pa
-    step = step[: errors_Pa.shape[1]]
-    sizes = step if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes + step
-    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ step), trace_error_sizes=sizes)
-
-
-def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
-    """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
-    a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
-    """
-    errors, state = systematics_of(predictor, solution, ["gauge"]), solution.state
-    columns, problem = errors.added_to(solution.columns, solution.problem)
-    state = replace(state, theta=np.append(state.theta, np.zeros(errors.count)))
-    step, _, _ = levenberg_marquardt_step(predictor.products(columns), problem, state, 0.0)
-    estimates = np.append(step[len(step) - errors.count :], 0.0)[errors.places]
-    for row, trial_data in zip(estimates, predictor.data, strict=True):
-        if trial_data.trace_error_sizes is not None and row.size:
-            row[: trial_data.trace_error_sizes.size] -= trial_data.trace_error_sizes
-    return np.asarray(estimates)
 
 
 # ------------------------------------------------------------------------------
@@ -301,13 +212,6 @@ def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
         notes.append(remark("weighted_as_stated"))
     smoothed = dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None)
     notes += [remark("smoothed", note=note) for note in smoothed]
-    largest_Pa = [
-        float(np.max(np.abs(each.trace_errors_Pa @ each.trace_error_sizes)))
-        for each in data
-        if each.trace_errors_Pa is not None and each.trace_error_sizes is not None
-    ]
-    if largest_Pa:
-        notes.append(remark("pressures_corrected", count=len(largest_Pa), largest_kPa=max(largest_Pa) / 1e3))
     return notes
 
 
@@ -320,10 +224,9 @@ def assemble(
     profile: bool,
 ) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
-    layout, state = predictor.layout, solution.state
-    plain = solution.log_likelihood() - 0.5 * trace_error_penalty(predictor.data)
-    smooth = smooth_errors(predictor, solution, options.get("held"))
-    extended = smooth.solution if smooth else solution
+    layout = predictor.layout
+    with_errors = with_systematics(predictor, solution, options.get("held"))
+    extended = with_errors.solution
     by_noise = precision(extended)
     trials = _trial_fits(predictor, solution, by_noise.first(len(layout.free)))
     pooled = _pooled_if_few(predictor, solution, options)
@@ -333,9 +236,8 @@ def assemble(
             pooled.solution,
             replace(by_noise, covariance=np.where(unknown, math.inf, pooled.covariance)),
         )
-    if smooth is not None:
-        trials = _with_smooth_errors_removed(trials, smooth)
-    precision_of_fit = widened_covariance(predictor, solution, by_noise, extended if smooth else None, pooled)
+    trials = _with_errors_removed(trials, with_errors)
+    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources, pooled)
     precision_of_fit = precision_of_fit.first(len(layout.free))
     numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
     count = len(numbers)
@@ -343,7 +245,7 @@ def assemble(
     between = _in_SI_units(layout, numbers, between)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
-    variance_state = smooth.solution.state if smooth else state
+    variance_state = with_errors.solution.state
     variance = float(np.average(variance_state.variance, weights=weights)) / (1 - variance_state.rho**2)
     has_deviations = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
     # Yield pressures belong to the trials and stay in the numbers.
@@ -364,7 +266,7 @@ def assemble(
         noise_m=math.sqrt(variance),
         noise_correlation=variance_state.rho,
         chi2_per_dof=chi2,
-        log_likelihood=plain + smooth.gain if smooth else plain,
+        log_likelihood=solution.log_likelihood() + with_errors.gain,
         trials=trials,
         messages=fit_messages(predictor, solution, numbers, precision_of_fit, between, chi2),
         left_out=dict(left_out),
@@ -374,16 +276,16 @@ def assemble(
         solution=solution,
         options=options,
         between=between,
-        smooth=smooth.solution.state if smooth else None,
+        with_errors=variance_state,
     )
 
 
-def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
-    """Trials with the deviations and residuals of the fit that includes smooth errors of position. The deviations come
+def _with_errors_removed(trials: Sequence[TrialFit], with_errors: WithSystematics) -> tuple[TrialFit, ...]:
+    """Trials with the deviations and residuals of the fit that includes the systematic errors. The deviations come
     from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit are
     (LARGEST_DEVIATION). The residuals are those of the step itself.
     """
-    effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    effects = np.clip(with_errors.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return tuple(
         replace(
             trial,
@@ -391,7 +293,7 @@ def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors
             pressure_deviation=float(values[PRESSURE]),
             damping_deviation=math.expm1(values[DAMPING_DEVIATION]),
         )
-        for trial, white, values in zip(trials, smooth.whitened, effects, strict=True)
+        for trial, white, values in zip(trials, with_errors.whitened, effects, strict=True)
     )
 
 

@@ -610,10 +610,6 @@ FORMS: dict[str, Callable[[Any], str]] = {
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
-    "pressures_corrected": lambda count, largest_kPa: (
-        f"recorded pressures of {f'{count} trials' if count > 1 else 'one trial'} are corrected by up to"
-        f" {largest_kPa:.2g} kPa, within the errors that the noise of the gauge leaves, to agree with the motion"
-    ),
     "no_tube": lambda column: (
         f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
         " body that moves as a whole has none"

@@ -32,7 +32,7 @@ from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
-from vinetrack.inference.robust_covariance import FILM_ERROR
+from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative import sentence
 
 if TYPE_CHECKING:

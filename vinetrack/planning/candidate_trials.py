@@ -281,7 +281,7 @@ def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
             predictor.data, state.trial_effects, solution.columns, state.variance, strict=True
         )
     ]
-    return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), smooth=None)
+    return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), with_errors=None)
 
 
 # ------------------------------------------------------------------------------

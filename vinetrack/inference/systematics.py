@@ -1,0 +1,252 @@
+"""Systematic errors of a campaign, as nuisance parameters of every fit, each with a normal prior.
+
+Payloads, set pressures, gauge noise, slow errors of the tracker, the mass of the film, and an uncalibrated lens, which
+displaces the leading edge by a smooth function of its position. Most are shared by several trials and do not average
+out, so that neither replicates nor the scatter of trials reveal them. If neglected, they look like a small effect as
+soon as pressures and B vary little between trials. About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1)
+and D_i the displacements by one standard deviation: the linear mixed model of `marginal_likelihood` with more columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.marginal_likelihood import MixedProblem
+from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.sensitivity import ORIGIN, PRESSURE, Predictor, position_change
+
+PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
+
+FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
+
+
+# Sources of systematic errors in every fit: all but the film, which can be weighed
+SOURCES = ("payloads", "set pressures", "gauge", "tracking", "lens")
+
+# Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
+HALF_WAVES = 6
+
+
+@dataclass(frozen=True)
+class Systematics:
+    """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
+    payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
+    columns only for those that affect it. `places`, shape (n_trials, n_columns), gives the error of each column, -1 for
+    none, and `sources`, shape (count,), where each error comes from.
+    """
+
+    columns: list[Floats]
+    places: NDArray[np.int_]
+    sources: Sequence[str]
+
+    @property
+    def count(self) -> int:
+        """Number of errors."""
+        return len(self.sources)
+
+    def beside(self, columns: Sequence[Floats], sizes: Floats | None = None) -> list[Floats]:
+        """Columns of a fit with those of the errors before the residual, which is that at these sizes, by default zero.
+        Shapes: columns (n_points, k) → (n_points, k + n_columns); sizes (count,).
+        """
+        of_trials = np.append(np.zeros(self.count) if sizes is None else sizes, 0.0)[self.places]
+        return [
+            np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1] - systematic @ at])
+            for of_fit, systematic, at in zip(columns, self.columns, of_trials, strict=True)
+        ]
+
+    def among(self, problem: MixedProblem) -> MixedProblem:
+        """The problem of a fit with the errors as further parameters, each with a standard normal prior."""
+        places = np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)
+        return replace(with_unknowns(problem, self.count), index=np.column_stack([problem.index, places]))
+
+
+# By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
+Displaced = Mapping[int, tuple[Hashable, Floats]]
+
+
+def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[str] = SOURCES) -> Systematics:
+    """The systematic errors of a fit that come from these sources: those of every fit, and `film`."""
+    functions: dict[str, Callable[[Predictor, Solution], Displaced]] = {
+        "payloads": _payload_errors,
+        "set pressures": _set_pressure_errors,
+        "gauge": _gauge_errors,
+        "film": _film_errors,
+        "tracking": _tracker_errors,
+        "lens": _lens_errors,
+    }
+    data = predictor.data
+    columns: list[list[Floats]] = [[np.zeros((each.time_s.size, 0))] for each in data]
+    places: list[list[int]] = [[] for _ in data]
+    errors: dict[tuple[str, Hashable, int], int] = {}
+    for source in sources:
+        displaced = functions[source](predictor, solution)
+        width = max((moved_m.shape[1] for _, moved_m in displaced.values()), default=0)
+        for i, (nothing, *_) in enumerate(columns):
+            group, moved_m = displaced.get(i, (None, nothing))
+            own = [errors.setdefault((source, group, k), len(errors)) for k in range(moved_m.shape[1])]
+            places[i] += own + [-1] * (width - len(own))
+            columns[i].append(np.pad(moved_m, ((0, 0), (0, width - len(own)))))
+    index = np.array(places, dtype=int).reshape(len(data), -1)
+    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors])
+
+
+def _changes_of(
+    predictor: Predictor, solution: Solution, varied: Sequence[tuple[int, FitTrial]]
+) -> Iterator[tuple[int, Floats]]:
+    """Indices of trials, each as it is or as it might be, and the change of their positions, m, shape (n_points, 1);
+    nothing where one cannot be simulated.
+    """
+    if not varied:
+        return
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    trials = [i for i, _ in varied]
+    once = list(dict.fromkeys(trials))
+    other = Predictor(predictor.layout, [trial_data for _, trial_data in varied], predictor.host)
+    try:
+        plain = dict(zip(once, predictor.run(jobs[once]), strict=True))
+        moved = other.run(replace(jobs[trials], trial=np.arange(len(varied))))
+    except SimulationError:
+        return
+    for i, trajectory in zip(trials, moved, strict=True):
+        yield i, position_change(plain[i], trajectory)[:, None]
+
+
+def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
+    payload_step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
+    heavier = [
+        (i, replace(each, trial=replace(each.trial, payload_kg=(1 + payload_step) * each.trial.payload_kg)))
+        for i, each in enumerate(predictor.data)
+        if each.trial.payload_kg > 0 and each.trial.travel_ratio != 1
+    ]
+    # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
+    return {
+        i: (round(predictor.data[i].trial.payload_kg, 9), 0.005 / payload_step * change_m)
+        for i, change_m in _changes_of(predictor, solution, heavier)
+    }
+
+
+def _film_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Error of the film mass of each vine, `FILM_ERROR`."""
+    heavier = [
+        (
+            i,
+            replace(
+                each, trial=replace(each.trial, film_density_kg_m3=(1 + FILM_ERROR) * each.trial.film_density_kg_m3)
+            ),
+        )
+        for i, each in enumerate(predictor.data)
+        if each.trial.linear_density_kg_m > 0
+    ]
+    return {i: (predictor.data[i].trial.vine, change_m) for i, change_m in _changes_of(predictor, solution, heavier)}
+
+
+def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Error of the set pressure of each condition, shared by its replicates."""
+    return {
+        i: (each.trial.condition, PRESSURE_ERROR_PA / each.trial.pressure_Pa * solution.columns[i][:, [PRESSURE]])
+        for i, each in enumerate(predictor.data)
+        if predictor.has_pressure_deviation[i] and each.trace is None
+    }
+
+
+def _gauge_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
+    misread = [
+        (i, replace(each, trace=(each.trace[0], each.trace[1] + error_Pa)))
+        for i, each in enumerate(predictor.data)
+        if each.trace is not None and each.trace_errors_Pa is not None
+        for error_Pa in each.trace_errors_Pa.T
+    ]
+    of_trial: dict[int, list[Floats]] = {}
+    for i, change_m in _changes_of(predictor, solution, misread):
+        of_trial.setdefault(i, []).append(change_m)
+    return {i: (i, np.hstack(changes_m)) for i, changes_m in of_trial.items()}
+
+
+def _lens_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Smooth errors of position that all trials of a camera share: Legendre polynomials of order 1 to 4 over the
+    growth, each minus its value where the edge rests, of standard deviation `position_systematic_mm`.
+    """
+    return {i: ("", shapes) for i, shapes in enumerate(position_shapes(predictor, grown_in(predictor, solution)))}
+
+
+def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
+    """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
+    grown = grown_in(predictor, solution)
+    # With extreme parameters no trial moves, and all growth fractions are zero.
+    largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
+    return {
+        i: ("", _slow_shapes(growth_m / largest_growth_m, each.slow_m))
+        for i, (growth_m, each) in enumerate(zip(grown, predictor.data, strict=True))
+        if each.slow_m is not None
+    }
+
+
+def _slow_shapes(part: Floats, slow_m: Floats) -> Floats:
+    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m. Waves along the growth
+    have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
+    the very start and one after it; two more grow towards the end.
+    """
+    end_shapes = ((0.1, 2.0), (0.03, 4.0))  # Fractions of the growth before its end (measured)
+    usual = np.minimum(slow_m, np.median(slow_m))
+    excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
+    waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
+    # 0.015: fraction of the growth over which a slow error that is larger at the start may decay (chosen)
+    start = np.exp(-np.maximum(part, 0.0) / 0.015)
+    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in end_shapes]
+    return np.column_stack([waves, excess * start, excess * (1 - start), *ends])
+
+
+def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
+    """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
+    trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
+    """
+    orders = (1, 2, 3, 4)  # Legendre orders of the shapes
+    sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
+    if not (sigma_m > 0).any():
+        return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
+    # Without any growth the shapes are zero, since their value at rest is subtracted.
+    # 1e-9: growth that counts as none (derived)
+    reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
+    select = np.eye(max(orders) + 1)[list(orders)].T
+    # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
+    at_rest = (-1.0) ** np.array(orders)
+    return [
+        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
+        for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
+    ]
+
+
+def with_unknowns(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
+    """The problem with further free parameters, each with a normal prior of mean 0 and on all trials."""
+    places = problem.prior_mean.size + np.arange(count)
+    # A column that belongs to no free parameter has index −1, the appended zero.
+    index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
+    return replace(
+        problem,
+        index=index,
+        prior_mean=np.append(problem.prior_mean, np.zeros(count)),
+        prior_precision=np.append(problem.prior_precision, np.full(count, prior_precision)),
+        lower=np.append(problem.lower, np.full(count, -np.inf)),
+        upper=np.append(problem.upper, np.full(count, np.inf)),
+        free=np.append(problem.free, np.ones(count, dtype=bool)),
+        random=np.append(problem.random, np.zeros(count, dtype=bool)),
+    )
+
+
+def grown_in(predictor: Predictor, solution: Solution) -> list[Floats]:
+    """Growth of each trial by a fit, m, shape (n_points,)."""
+    return [
+        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
+        for trial_data, trial_effects, columns in zip(
+            predictor.data, solution.state.trial_effects, solution.columns, strict=True
+        )
+    ]
