@@ -121,7 +121,7 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
-    tracks, theta = slowed.tracks, slowed.tracks.theta
+    tracks, theta = slowed.start, slowed.start.theta
     domains = learning.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))
     growth, pressure = (smooth.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
@@ -165,11 +165,11 @@ def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_conditio
     low, high = (float(word) for word in best["words"].split(" mm")[0].split("between ")[1].split(" and "))
     assert (low, high) == pytest.approx((120, 150), abs=2)
     assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
-    assert set(patch.table["against"]) == {"lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"}
-    along = patch.table[(patch.table["against"] == "lead_position_m") & (patch.table["condition"] != "")]
+    along = patch.table[patch.table["condition"] != ""]
+    assert along[["lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"]].notna().all(axis=None)
     for _, one in along.groupby("condition"):
         lowest = one.loc[one["force_N"].idxmin()]
-        assert 0.1 < lowest["value"] < 0.17
+        assert 0.1 < lowest["lead_position_m"] < 0.17
         assert -0.7 < lowest["force_N"] - one["force_N"].median() < -0.2
 
 
@@ -212,7 +212,9 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
             moved.append(simulate_many(with_force, trials, times, parameters=rows, relative_tolerance=1e-7))
         for answer, more, less in zip(answers, *moved, strict=True):
             exact = (more.observed_position_m - less.observed_position_m) / 2e-3
-            assert np.max(np.abs(answer[:, k] - exact)) < 2e-3 * np.max(np.abs(exact))
+            ended = (more.time_s >= more.end_time_s) | (less.time_s >= less.end_time_s)  # NaN: growth goes on
+            off = (answer[:, k] - exact)[~ended]
+            assert np.max(np.abs(off)) < 2e-3 * np.max(np.abs(exact))
 
 
 DOMAINS = [
@@ -256,16 +258,16 @@ SCALES = {"falling_with_speed": 1.5, "fading_in_time": 0.04, "fading_along": 0.0
 BEYOND = {"beyond_a_place": (0.06, 0.1), "beyond_a_speed": (1.2, 7.8), "squared_beyond_a_speed": (1.2, 61.0)}
 LAWS = [
     *(laws.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
-    *(laws.Law(name, scale=scale) for name, scale in SCALES.items()),
-    *(laws.Law(name, scale=scale, peak=peak) for name, (scale, peak) in BEYOND.items()),
+    *(laws.Law(name, (scale,)) for name, scale in SCALES.items()),
+    *(laws.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
     laws.Law("speed", peak=9.0, reference_area_m2=3e-4),
-    laws.Law("inverse_speed", scale=2.5, peak=1.7),
-    laws.Law("patch", low=0.08, high=0.11),
+    laws.Law("inverse_speed", (2.5,), peak=1.7),
+    laws.Law("patch", (0.08, 0.03)),
     laws.Law("position", factor="speed", peak=4.0),
-    laws.Law("patch", low=0.08, high=0.11, factor="pressure", peak=3e4),
-    laws.Law("falling_with_speed", scale=1.5, factor="position"),
+    laws.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
+    laws.Law("falling_with_speed", (1.5,), "position"),
     laws.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    laws.Law("periodic", scale=0.03),
+    laws.Law("periodic", (0.03, 0.0)),
 ]
 
 

@@ -30,7 +30,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.gaussian_processes import splines, whiten
+from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, root_of_covariance, splines, whiten
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     eliminated,
@@ -109,7 +109,6 @@ class FittedMotion:
     acceleration: Floats
     observed_slope: Floats
     observation_offset_m: Floats
-    end_s: float
     counts_until_s: float
     pressure_Pa: Floats
     mass_kg: Floats
@@ -180,7 +179,7 @@ def _motion(
         FittedMotion(
             trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros, slope,
             run.observed_position_m - run.lead_position_m,
-            end_s=run.end_time_s if run.status == "ended" else math.inf, counts_until_s=math.inf,
+            counts_until_s=math.inf,
             pressure_Pa=zeros, mass_kg=zeros, model_acceleration=zeros, stiffness=zeros, friction=zeros,
         )
     )  # fmt: skip
@@ -230,8 +229,7 @@ def acceleration_sensitivities(
         observed = _between_steps(
             motion, since_s, response * motion.observed_slope[:, None] / motion.trial.travel_ratio
         )
-        growing = (since_s > 0) & (since_s <= motion.end_s)
-        sensitivities.append(np.where(growing[:, None], observed, 0.0))
+        sensitivities.append(np.where(since_s[:, None] > 0, observed, 0.0))
     return sensitivities
 
 
@@ -273,59 +271,40 @@ def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> Fitted
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
-# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
-# with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4), which takes a release that is a frame
-# off for noise. It is not used as data: the equation of motion is linearised about this motion, and
+# The acceleration of every trial is a smooth function of time, a Gaussian process, integrated twice from rest at its
+# release and fitted to positions. It is not used as data: the equation of motion is linearised about this motion, and
 # the defect there (what the model's forces lack) enters as one more known acceleration, so that noise in the smoothed
 # motion cancels to first order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a
 # large force the linearisation would be poor.
 
 
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
+    from scipy.integrate import cumulative_trapezoid
+
     since_s = data.time_s - trial_effects[RELEASE]
     position_m = data.lead_position_m - trial_effects[ORIGIN]
     position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
     growing = (since_s > 0) & ~(position_m > MOST_OF_LENGTH * motion.trial.length_m)
     if np.count_nonzero(growing) <= 2:
         return motion
-    last_s = float(since_s[growing].max())
-    # 20: splines, even in the square root of time and so denser where a vine accelerates (chosen)
-    accelerations = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), 20)
-    velocities = _integrated(motion.time_s, accelerations)
-    positions = _integrated(motion.time_s, velocities)
-    coefficients = _smoothed(_between_steps(motion, since_s[growing], positions), position_m[growing])
+    last_s, count = float(since_s[growing].max()), 20  # Splines (chosen)
+    # Even in the square root of time, and so denser where a vine accelerates
+    accelerations = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), count)
+    velocities = cumulative_trapezoid(accelerations, motion.time_s, axis=0, initial=0)
+    positions = cumulative_trapezoid(velocities, motion.time_s, axis=0, initial=0)
+    rows = np.column_stack([_between_steps(motion, since_s, positions), position_m])[growing]
+    products = rows.T @ rows / data.mean_noise_m**2
+    # Amplitudes, in parts of the acceleration that would be the same throughout (chosen)
+    amplitudes = 2 * rows[:, -1].max() / last_s**2 * np.geomspace(0.1, 30, 9)
+    priors = [root_of_covariance(count, length) for length in LENGTH_SCALES]
+    coefficients = posterior(products[:-1, :-1], products[:-1, -1], priors, amplitudes).mean
     return replace(
         motion,
         lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
         lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
         acceleration=motion.trial.travel_ratio * (accelerations @ coefficients),
-        # The model's end of growth is not that of the track: the vine responds to forces beyond it.
-        end_s=math.inf,
         counts_until_s=last_s,
     )
-
-
-def _smoothed(design: Floats, values: Floats) -> Floats:
-    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
-    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
-    gram = design.T @ design
-    unit = float(np.trace(gram)) / design.shape[1]
-    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
-    found = []
-    # Penalties, relative to the information from positions (chosen)
-    for penalty in np.geomspace(1e-8, 1e2, 21):
-        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
-        coefficients = inverse @ (design.T @ values)
-        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
-        squares = float(np.sum((values - design @ coefficients) ** 2))
-        found.append((squares / (values.size - degrees_of_freedom) ** 2, coefficients))
-    return min(found, key=lambda each: each[0])[1]
-
-
-def _integrated(time_s: Floats, columns: Floats) -> Floats:
-    """Cumulative integrals of the columns by the trapezoidal rule, 0 at the first time."""
-    steps = 0.5 * (columns[1:] + columns[:-1]) * np.diff(time_s)[:, None]
-    return np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(steps, axis=0)])
 
 
 # ------------------------------------------------------------------------------
@@ -366,8 +345,8 @@ class ForceEstimate(NamedTuple):
 class ForceProblem:
     """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
     noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
-    have the standard deviations estimated from replicates. At its fitted parameters, `tracks` are the motions that lie
-    on the tracks, whatever the model says, and `fitted` those of the model.
+    have the standard deviations estimated from replicates. `start` has the fitted parameters, and motions that lie on
+    the tracks, whatever the model says.
     """
 
     def __init__(self, fit: Fit, scatter: Scatter) -> None:
@@ -385,8 +364,7 @@ class ForceProblem:
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
         motions = [_on_track(*each) for each in zip(self.data, effects, motions_of(fit, effects), strict=True)]
-        self.tracks = self.point(state.theta, effects, motions)
-        self.fitted = self.point(state.theta, state.trial_effects, motions_of(fit, state.trial_effects))
+        self.start = self.point(state.theta, effects, motions)
 
     def inflation(self, chi2: float) -> float:
         """Variance in units of the noise's where a model leaves this χ². What it leaves beyond the noise is correlated

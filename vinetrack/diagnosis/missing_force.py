@@ -112,6 +112,11 @@ class Domain:
             first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
         return first
 
+    def force(self, found: Posterior, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.basis(values)
+        return basis @ found.mean, standard_error(basis, found.covariance)
+
     def unit_push(self, motion: FittedMotion) -> Floats:
         """The splines along a motion, shape (n_times, n_splines)."""
         return self.basis(self.values_along(motion))
@@ -259,39 +264,12 @@ class LearnedForce:
 
     def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
         """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
-        basis = self.domain.basis(values)
-        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+        return self.domain.force(self.found, values)
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
-        import pandas as pd
-
-        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-        domain = self.domain
-        axes = [
-            np.linspace(low, high, plot_points[len(domain.variables) - 1])
-            for low, high in zip(domain.low, domain.high, strict=True)
-        ]
-        grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
-        trials = np.zeros(grid[0].size, dtype=int)
-        along: dict[str, list[Floats]] = {}
-        for motion in self.motions:
-            visited = domain.values_along(motion)
-            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
-            for at, course in zip(domain.normalised(grid), domain.normalised(visited), strict=True):
-                near &= np.abs(at[:, None] - course) < visited_distance
-            trials += near.any(axis=1)
-            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
-            along.setdefault(motion.trial.condition, [values[points] for values in visited])
-        parts = []
-        for condition, values in {"": grid, **along}.items():
-            force_N, sigma_N = self.force(values)
-            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan)
-            columns |= {VARIABLES[name]: at for name, at in zip(domain.variables, values, strict=True)}
-            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
-            parts.append(pd.DataFrame(columns | {"condition": condition}))
-        return pd.concat(parts, ignore_index=True)
+        """The force on a grid, and along the first trial of each condition."""
+        return force_table(self.domain, self.found, self.motions)
 
     @property
     def visited(self) -> pd.DataFrame:
@@ -328,6 +306,37 @@ class LearnedForce:
             "begins": self.at_start,
             "sentence": str(self.sentence),
         }
+
+
+def force_table(domain: Domain, found: Posterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
+    """A force on a grid of its variables (condition blank), with the number of trials that visited each point, and
+    along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
+    """
+    import pandas as pd
+
+    plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+    axes = [
+        np.linspace(low, high, plot_points[len(domain.variables) - 1])
+        for low, high in zip(domain.low, domain.high, strict=True)
+    ]
+    grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
+    trials = np.zeros(grid[0].size, dtype=int)
+    parts = {"": dict(zip((VARIABLES[name] for name in domain.variables), grid, strict=True))}
+    for motion in motions:
+        near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+        for at, course in zip(domain.normalised(grid), domain.normalised(domain.values_along(motion)), strict=True):
+            near &= np.abs(at[:, None] - course) < visited_distance
+        trials += near.any(axis=1)
+        points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+        along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
+        parts.setdefault(motion.trial.condition, along)
+    tables = []
+    for condition, values in parts.items():
+        force_N, sigma_N = domain.force(found, [values[VARIABLES[name]] for name in domain.variables])
+        columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
+        columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+        tables.append(pd.DataFrame(columns | {"condition": condition}))
+    return pd.concat(tables, ignore_index=True)
 
 
 def learned_force(
@@ -474,7 +483,6 @@ def _largest_N(motions: Sequence[FittedMotion]) -> float:
 # ------------------------------------------------------------------------------
 # What is missing.
 
-FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
 LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
@@ -485,9 +493,7 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 @dataclass(frozen=True)
 class MissingForce:
-    """What is missing, as a force on the tail, N. `table`, columns `FORCE_COLUMNS`: the force of every condition
-    (blank: mean over all) against `lead_position_m`, `tail_velocity_m_s`, `time_s` and `pressure_Pa`.
-    """
+    """What is missing, as a force on the tail, N. `table` is that over its most likely variables, see `force_table`."""
 
     table: pd.DataFrame
     laws: pd.DataFrame
@@ -518,16 +524,14 @@ def force_problem(fit: Fit) -> ForceProblem:
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
     problem = force_problem(fit)
-    choices, learned = list[Choice](), None
+    first = choices = choices_seen_from(problem, problem.start)
+    learned = None
     with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
-        choices = choices_seen_from(problem, problem.tracks)
         misfit = choices[0].equations.chi2 - problem.n_points
         log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in choices}
         choices = choices_seen_from(problem, _under_best(problem, choices))
         learned = learned_force(problem, choices, misfit, log_bayes_factors)
-    # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
-    of_model = choices_seen_from(problem, problem.fitted)
-    choices = min(choices or of_model, of_model, key=_least_chi2)
+    choices = min(first, choices, key=_least_chi2)
     point, chi2 = choices[0].equations.point, choices[0].equations.chi2
     laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
     smooth = {choice.domain.name: choice.best.delta_chi2_beyond_chance for choice in choices}
@@ -540,54 +544,13 @@ def missing_force(fit: Fit) -> MissingForce:
     reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
     drawn = max(choices, key=lambda choice: choice.found.log_evidence) if learned is None else learned
     return MissingForce(
-        table=_force_table(_curves(drawn.domain, drawn.found, point.motions)),
+        table=force_table(drawn.domain, drawn.found, point.motions),
         laws=_law_table(laws),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
         detected=tuple(law for law in laws if law.is_detected),
         learned=learned,
     )
-
-
-def _curves(domain: Domain, found: Posterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
-    """The smooth force along the first trial's motion of every condition, without the ends where it is hardly
-    determined. Columns `VARIABLES`, force, error and condition.
-    """
-    import pandas as pd
-
-    curves = []
-    for condition, motion in {motion.trial.condition: motion for motion in reversed(motions)}.items():
-        # 24: points of a curve (chosen)
-        y = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
-        time_s = np.interp(y, motion.lead_position_m, motion.time_s)
-        values = {name: np.interp(time_s, motion.time_s, getattr(motion, name)) for name in VARIABLES.values()}
-        basis = domain.basis([values[VARIABLES[name]] for name in domain.variables])
-        sigma_N = standard_error(basis, found.covariance)
-        curve = pd.DataFrame(values | {"force_N": basis @ found.mean, "sigma_N": sigma_N, "condition": condition})
-        # 2.0: multiple of the median standard error above which a force is not drawn (chosen)
-        curves.append(curve[sigma_N <= 2.0 * np.median(sigma_N)])
-    return pd.concat(curves, ignore_index=True)
-
-
-def _force_table(curves: pd.DataFrame) -> pd.DataFrame:
-    """The force against each variable, by condition and as weighted means over all conditions in ten bins, their errors
-    at least as large as conditions differ.
-    """
-    import pandas as pd
-
-    by_condition, means = [], []
-    for against in VARIABLES.values():
-        points = curves.rename(columns={against: "value"}).assign(against=against)
-        by_condition.append(points)
-        low, high = points["value"].min(), points["value"].max()
-        for _, inside in points.groupby(np.minimum(10 * (points["value"] - low) // max(high - low, 1e-300), 9)):
-            force_N, weight = inside["force_N"], 1 / inside["sigma_N"] ** 2
-            mean, at = (float(np.average(each, weights=weight)) for each in (force_N, inside["value"]))
-            others = inside["condition"].nunique() - 1
-            scatter = math.sqrt(float(np.average((force_N - mean) ** 2, weights=weight)) / others) if others else 0.0
-            means.append((against, at, mean, max(float(weight.sum()) ** -0.5, scatter), ""))
-    columns = list(FORCE_COLUMNS)
-    return pd.concat([*by_condition, pd.DataFrame(means, columns=columns)], ignore_index=True)[columns]
 
 
 def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:

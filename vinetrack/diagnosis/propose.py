@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Track
+from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS, STATE
@@ -124,9 +123,11 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
     largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
     at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in domain.variables}
     worked_N = float(learned.force([np.array([value]) for value in at.values()])[0][0])
+    table, digits = learned.found.mean.reshape(domain.counts), {"float_kind": "{:.6g}".format}
+    numbers = np.array2string(table, 110, separator=", ", threshold=table.size, formatter=digits)  # type: ignore[arg-type]
     return _source(
         str(remark("learned_file", learned=learned, origin=origin)),
-        constants=_table_lines(learned.found.mean.reshape(domain.counts)),
+        constants=[f"TABLE = np.array({numbers})  # N\n"],
         parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
         arguments={"a": 1.0},
         body=[*(line for k in range(len(domain.variables)) for line in _axis_code(domain, k)), *_sum_code(domain)],
@@ -211,20 +212,6 @@ def _axis_code(domain: Domain, k: int) -> list[str]:
 
 def _code_number(value: float) -> str:
     return repr(float(f"{value:.12g}"))
-
-
-def _table_lines(table: Floats) -> list[str]:
-    """The table as lines of code: a tuple of numbers, or a tuple of rows."""
-    table_digits = 6  # Significant digits of a coefficient in the file (chosen)
-    if table.ndim == 1:
-        numbers = ", ".join(f"{value:.{table_digits}g}" for value in table.tolist())
-        return [
-            "TABLE = np.array((  # N",
-            *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
-            "))\n",
-        ]
-    rows = [f"    ({', '.join(f'{value:.{table_digits}g}' for value in row)})," for row in table.tolist()]
-    return ["TABLE = np.array((  # N", *rows, "))\n"]
 
 
 # ------------------------------------------------------------------------------
@@ -372,20 +359,19 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
     worked example.
     """
     law, form = detected.law, FORMS[detected.law.kind]
-    times, symbol, unit = "", "", list(form.size[2])
+    times, symbol, unit = "", "", form.size[2]
     if law.factor:
         by = FORMS[law.factor]
         times, symbol = f" * {by.code}", f" {by.formula.split()[-1]}"
-        unit = [a + b for a, b in zip(unit, by.size[2], strict=True)]
-        unit[0] -= 1  # Not N²
+        unit += by.size[2].removeprefix("N")
     size, *shapes = (float(f"{value:.6g}") for value in _values(detected))
     limit = 100 * abs(size)
-    of_size = (*form.size[:2], _unit(unit))
+    of_size = (*form.size[:2], unit)
     parameters = [
         _parameter(of_size, repr(size), (-limit, limit), (0.0, 10 * size), 'meaning="size of the law"'),
-        *(_shape_parameter(*each) for each in zip(form.shapes, shapes, strict=True)),
+        *(_shape_parameter(shape[:3], value) for shape, value in zip(form.shapes, shapes, strict=True)),
     ]
-    names = [form.size[0], *(name for name, _, _ in form.shapes)]
+    names = [form.size[0], *(shape.name for shape in form.shapes)]
     formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), []
     if law.reference_area_m2:
         times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
@@ -408,8 +394,8 @@ def _values(detected: RankedLaw) -> tuple[float, ...]:
     """Size and shape parameters of a law as its effect holds them, SI."""
     law, amplitude = detected.law, detected.estimate.amplitude
     if law.kind == "periodic":
-        return math.hypot(*amplitude), law.scale, math.atan2(amplitude[1], amplitude[0])
-    return amplitude[0] / law.peak, *law.shape_values
+        return math.hypot(*amplitude), law.shapes[0], math.atan2(amplitude[1], amplitude[0])
+    return amplitude[0] / law.peak, *law.shapes
 
 
 def _force_N(detected: RankedLaw) -> float:
@@ -417,17 +403,6 @@ def _force_N(detected: RankedLaw) -> float:
     state = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
     motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
     return float((detected.law.unit_force(motion) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
-
-
-def _unit(powers: Sequence[int]) -> str:
-    """A unit by its exponents of N, m, s and Pa."""
-    above: list[str] = []
-    below: list[str] = []
-    for name, power in zip(("N", "m", "s", "Pa"), powers, strict=True):
-        if power:
-            (above if power > 0 else below).append(name + {1: "", 2: "²", 3: "³", 4: "⁴"}[abs(power)])
-    denominator = "·".join(below)
-    return "·".join(above) + (f"/({denominator})" if len(below) > 1 else f"/{denominator}" if below else "")
 
 
 def _shape_parameter(names: tuple[str, str, str], value: float) -> str:

@@ -413,12 +413,13 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
     if law.factor:
         by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}[law.factor]
         form, place = f"{form}, times {by}", "{size} at its largest"
+    scale = law.shapes[0] if law.shapes else math.nan
     text = (f"{form}, {place}" if place else form).format(
         size=size,
-        low=f"{1e3 * max(law.low, 0.0):.0f}",
-        high=f"{1e3 * law.high:.0f}",
-        milli=number(1e3 * law.scale),
-        scale=f"{law.scale:.2g}",
+        low=f"{1e3 * max(scale, 0.0):.0f}",
+        high=f"{1e3 * sum(law.shapes):.0f}",
+        milli=number(1e3 * scale),
+        scale=f"{scale:.2g}",
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
 
