@@ -56,7 +56,6 @@ class Failure:
     with the scatter of replicates.
     """
 
-    model: str
     pressure_unit: str
     by_condition: pd.DataFrame
     along_time: pd.DataFrame
@@ -90,7 +89,6 @@ def locate(fit: Fit) -> Failure:
     rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in conditions.items()]
     in_time = [(of, common_edges(of), name) for name, of in conditions.items()]
     return Failure(
-        model="+".join(fit.model.names),
         pressure_unit=predicted[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_time=_table("time_s", "s", in_time, scatter),
@@ -285,14 +283,17 @@ def _tests(fit: Fit) -> Iterator[ConstancyTest]:
         estimates = per_trial_estimates(fit, align_trials(fit))
         for against in COVARIATES:
             yield from _against(estimates, against)
-        yield from _along_growth(fit, estimates)
+        yield from _along_growth(estimates)
     yield from against_the_sheet(fit)
 
 
+def _subject(number: Number, vine: str, against: str) -> dict[str, object]:
+    """What rows of both tables are about: the parameter, its vine, and the condition."""
+    return {"parameter": number.key, "vine": vine, "symbol": number.symbol, "unit": number.unit, "against": against}
+
+
 def _tested(
-    number: Number,
-    vine: str,
-    against: str,
+    subject: dict[str, object],
     levels: tuple[float, float],
     change: tuple[float, float],
     p: tuple[float, ...],
@@ -304,9 +305,8 @@ def _tested(
     """A test as a row of the table: levels from and to, the change between them and its standard error. `p` are the
     p-values of a steady change and, where it is asked, of any; `told` is what the sentence about it needs besides.
     """
-    of_parameter = (number.key, vine, number.symbol, number.unit, against)
     numbers = (*levels, *change, _normal_deviate(p[0]), _normal_deviate(p[-1]), dof, n_trials)
-    row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
+    row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
     sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
     return ConstancyTest({**row, "sentence": sentence}, min(1.0, len(p) * min(p)), groups)
 
@@ -319,15 +319,14 @@ def _normal_deviate(p: float) -> float:
 
 
 def _group(
-    number: Number, vine: str, against: str, level: float, base: float, deviation: float, sigma: float, n_trials: int
+    subject: dict[str, object], level: float, base: float, deviation: float, sigma: float, n_trials: int
 ) -> dict[str, object]:
     """A row of the table of groups: B and its ratio to the common value `base`, each with its standard error, from the
     deviation of ln B and its standard error.
     """
     ratio = math.exp(deviation)
-    of_parameter = (number.key, vine, number.symbol, number.unit, against)
     numbers = (level, base * ratio, base * ratio * sigma, ratio, ratio * sigma, n_trials)
-    return dict(zip(GROUP_COLUMNS, (*of_parameter, *numbers), strict=True))
+    return subject | dict(zip(GROUP_COLUMNS[len(subject) :], numbers, strict=True))
 
 
 # ------------------------------------------------------------------------------
@@ -340,8 +339,8 @@ MAX_DEVIATION = 3.0  # Largest deviation of ln B from the common value (chosen)
 class PerTrialEstimates:
     """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `base` the common value, `deviation` that
     of the best ln B of the trial from it, NaN where a trial does not depend on it; `variance` is that from a typical
-    scatter of pressure and B, up to a factor. At the best fit, `trial_effects` have shape (n_trials, 4), and `columns`
-    are the sensitivities, `nuisances` those of release and origin among them.
+    scatter of pressure and B, up to a factor. `halves`, shape (n_trials, 2), are the best deviations in each half of
+    the growth, NaN where they are not known.
     """
 
     number: Number
@@ -349,9 +348,7 @@ class PerTrialEstimates:
     base: Floats
     deviation: Floats
     variance: Floats
-    trial_effects: Floats
-    columns: Sequence[Floats]
-    nuisances: list[list[int]]
+    halves: Floats
 
     @property
     def vines(self) -> NDArray[np.str_]:
@@ -384,7 +381,7 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
             columns = tuple(predictor.linearise(np.empty(0), trial_effects))
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
-    response, variance = np.empty(len(data)), np.empty(len(data))
+    response, variance, halves = np.empty(len(data)), np.empty(len(data)), np.empty((len(data), 2))
     for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
         sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])
         response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
@@ -393,6 +390,8 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
         scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
         variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
+        growth = data[i].lead_position_m - of_trial[:, -1] - trial_effects[i, ORIGIN]
+        halves[i] = trial_effects[i, DAMPING_DEVIATION] + _in_halves(growth, of_trial, others)
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
     known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
     return PerTrialEstimates(
@@ -401,10 +400,24 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         base=predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
         deviation=np.where(known, trial_effects[:, DAMPING_DEVIATION], np.nan),
         variance=variance,
-        trial_effects=trial_effects,
-        columns=columns,
-        nuisances=nuisances,
+        halves=halves,
     )
+
+
+def _in_halves(growth_m: Floats, columns: Floats, nuisances: list[int]) -> Floats:
+    """Best-fit change of ln B of one trial in each half of its growth, shape (2,), linearised about its own B: about
+    the common B, the between-trial scatter would enter in second order. What B does in the first half is carried
+    through the second as a shift in time, as where inertia is small. Shapes: growth_m (n_points,), columns (n_points,
+    n).
+    """
+    response, speed = columns[:, DAMPING_DEVIATION], -columns[:, RELEASE]
+    middle = int(np.argmax(growth_m >= 0.5 * growth_m.max()))
+    if not speed[middle] > 0 or response[middle] == 0:
+        return np.full(2, math.nan)
+    first = response.copy()
+    first[middle:] = response[middle] * speed[middle:] / speed[middle]
+    design = np.column_stack([first, response - first, columns[:, nuisances]])
+    return np.asarray(np.linalg.lstsq(design, columns[:, -1], rcond=1e-9)[0][:2])
 
 
 # ------------------------------------------------------------------------------
@@ -412,57 +425,68 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
 
 
 def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTest]:
-    """Tests against one condition: of each vine alone, and of all."""
-    levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
-    usable, vines = np.isfinite(levels) & np.isfinite(estimates.deviation), estimates.vines
-    varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    choices = [(vine, usable & (vines == vine)) for vine in varying]
-    choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
-    for vine, chosen in choices:
-        test = _trend(estimates, against, levels, vine, chosen)
-        if test is not None:
-            yield test
-
-
-def _trend(
-    estimates: PerTrialEstimates, against: str, levels: Floats, vine: str, chosen: NDArray[np.bool_]
-) -> ConstancyTest | None:
-    """Student's t test of a linear trend of the chosen estimates, and Fisher's F test of whether all levels have the
-    same mean, about the mean of each vine or of all; None without enough trials. Shapes: levels, chosen (n_trials,).
+    """Tests against one condition, of each vine alone and of all: of a linear trend, and by Fisher's F test whether all
+    levels have the same mean, both about the mean of each vine.
     """
     from scipy.stats import f as fisher
+
+    levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
+    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
+    coordinate, weight, vines = levels if linear else np.log(levels), 1 / estimates.variance, estimates.vines
+    usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
+    varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
+    replicates = _of_replicates(estimates.deviation, weight, estimates.conditions)
+    for vine in [*varying, *([""] if len(varying) > 1 else [])]:
+        chosen = usable & (np.isin(vines, varying) if vine == "" and len(varying) > 1 else vines == vine)
+        w, block, level = weight[chosen], vines[chosen], levels[chosen]
+        x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
+        n_vines = np.unique(block).size
+        steady = _steady_change(x, d, w, replicates, n_vines, LEAST_SCATTER**2)
+        if steady is None:
+            continue
+        slope, sigma, p, variance, dof = steady
+        cells = [f"{name} {value!r}" for name, value in zip(block, level.tolist(), strict=True)]
+        between = len(set(cells)) - n_vines
+        means = d - _centred(d, w, np.array(cells))
+        chi2 = float(np.sum(w * means**2))
+        p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
+        subject, groups = _subject(estimates.number, str(vine), against), []
+        for value in np.unique(level).tolist() if n_vines == 1 else ():
+            k = np.flatnonzero(chosen & (levels == value))
+            bases, error = estimates.base[k], math.sqrt(variance / float(np.sum(weight[k])))
+            base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
+            mean = float(np.average(estimates.deviation[k], weights=weight[k]))
+            groups.append(_group(subject, value, base, mean, error, k.size))
+        reach, ends = float(np.ptp(coordinate[chosen])), (float(level.min()), float(level.max()))
+        change = _relative(slope * reach, sigma * reach)
+        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, (p, p_constancy), dof, d.size, groups)
+
+
+def _steady_change(
+    x: Floats, d: Floats, weight: Floats, replicates: tuple[float, int], n_means: int, least: float
+) -> tuple[float, float, float, float, int] | None:
+    """Slope of values about `n_means` means, its standard error and p-value (Student's t), and the variance of the
+    values, relative to 1/weight, with its degrees of freedom: that of replicates, or about the slope, and at least
+    this. None where neither has enough degrees of freedom.
+    """
     from scipy.stats import t as student
 
-    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
-    coordinate = levels if linear else np.log(levels)
-    weight, blocks = 1 / estimates.variance, estimates.vines
-    w, block, level = weight[chosen], blocks[chosen], levels[chosen]
-    x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
-    square = float(np.sum(w * x**2))
-    if not square > 0:
-        return None
-    slope = float(np.sum(w * x * d)) / square
-    variance, dof = _of_replicates(estimates.deviation, weight, estimates.conditions)
+    square, (variance, dof) = float(np.sum(weight * x**2)), replicates
     if dof < FEWEST_DEGREES:
-        dof = d.size - np.unique(block).size - 1
-        if dof < FEWEST_DEGREES:
-            return None
-        variance = float(np.sum(w * (d - x * slope) ** 2)) / dof
-    variance = max(variance, LEAST_SCATTER**2)
+        dof = d.size - n_means - 1
+    if dof < FEWEST_DEGREES or not square > 0:
+        return None
+    slope = float(np.sum(weight * x * d)) / square
+    if replicates[1] < FEWEST_DEGREES:
+        variance = float(np.sum(weight * (d - x * slope) ** 2)) / dof
+    variance = max(variance, least)
     sigma = math.sqrt(variance / square)
-    p = float(2 * student.sf(abs(slope) / sigma, dof))
-    cells = [f"{name} {value!r}" for name, value in zip(block, level.tolist(), strict=True)]
-    between = len(set(cells)) - np.unique(block).size
-    means = d - _centred(d, w, np.array(cells))
-    chi2 = float(np.sum(w * means**2))
-    p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
-    low, high = float(level.min()), float(level.max())
-    ends = (low, high) if slope >= 0 else (high, low)
-    reach = float(np.ptp(coordinate[chosen]))
-    change = math.expm1(abs(slope) * reach), math.exp(abs(slope) * reach) * sigma * reach
-    alone = len(set(block.tolist())) == 1
-    groups = _groups(estimates, against, levels, vine, chosen, variance) if alone else ()
-    return _tested(estimates.number, vine, against, ends, change, (p, p_constancy), dof, d.size, groups)
+    return slope, sigma, float(2 * student.sf(abs(slope) / sigma, dof)), variance, dof
+
+
+def _relative(rise: float, sigma: float) -> tuple[float, float]:
+    """Relative change from the smaller value that a change of its logarithm is, with its standard error."""
+    return math.expm1(abs(rise)), math.exp(abs(rise)) * sigma
 
 
 def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
@@ -479,73 +503,31 @@ def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_])
     return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
 
 
-def _groups(
-    estimates: PerTrialEstimates,
-    against: str,
-    levels: Floats,
-    vine: str,
-    chosen: NDArray[np.bool_],
-    variance: float,
-) -> list[dict[str, object]]:
-    """Mean value of every group, with its standard error from the scatter of replicates."""
-    rows = []
-    for level in np.unique(levels[chosen]).tolist():
-        k = np.flatnonzero(chosen & (levels == level))
-        w, bases = 1 / estimates.variance[k], estimates.base[k]
-        base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
-        mean, sigma = float(np.average(estimates.deviation[k], weights=w)), math.sqrt(variance / float(np.sum(w)))
-        rows.append(_group(estimates.number, vine, against, level, base, mean, sigma, k.size))
-    return rows
-
-
-def _along_growth(fit: Fit, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
-    """Test ln B for a change along the growth, for every vine and for all: Student's t test of the mean difference of
-    the halves, each fitted by itself. The scatter of pressure and B between trials is the same in both halves and
-    cancels. An effect that builds up along the growth shows here even where n and the yield pressure absorb it in every
-    comparison between trials. The groups of a vine are its halves, which share the variance of their difference.
+def _along_growth(estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
+    """Test ln B for a change along the growth, for every vine and for all: the mean difference of the halves, each
+    fitted by itself. The scatter of pressure and B between trials is the same in both halves and cancels. An effect
+    that builds up along the growth shows here even where n and the yield pressure absorb it in every comparison between
+    trials. The groups of a vine are its halves, which share the variance of their difference.
     """
-    from scipy.stats import t as student
-
-    halves, vines = _halves(fit, estimates), estimates.vines
+    halves, vines = estimates.halves, estimates.vines
     usable = (np.abs(halves) <= MAX_DEVIATION).all(axis=1)
     names = list(dict.fromkeys(vines[usable].tolist()))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
-        rise = halves[chosen, 1] - halves[chosen, 0]
-        variance, dof = _of_replicates(rise, np.ones(rise.size), estimates.conditions[chosen])
-        if dof < FEWEST_DEGREES:
-            variance, dof = float(np.var(rise, ddof=1)) if rise.size > 1 else 0.0, rise.size - 1
-        if dof < FEWEST_DEGREES:
-            continue
+        rise, ones = halves[chosen, 1] - halves[chosen, 0], np.ones(chosen.size)
+        replicates = _of_replicates(rise, ones, estimates.conditions[chosen])
         # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
-        mean, sigma = float(rise.mean()), max(math.sqrt(variance), 2e-3) / math.sqrt(rise.size)
-        base = float(estimates.base[chosen[0]])
+        steady = _steady_change(ones, rise, ones, replicates, 0, 2e-3**2)
+        if steady is None:
+            continue
+        mean, sigma, p, _, dof = steady
+        subject, base = _subject(estimates.number, vine, "growth"), float(estimates.base[chosen[0]])
         groups = [
-            _group(estimates.number, vine, "growth", level, base, half, sigma / math.sqrt(2), rise.size)
+            _group(subject, level, base, half, sigma / math.sqrt(2), rise.size)
             for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True)
         ]
-        p = float(2 * student.sf(abs(mean) / sigma, dof))
-        change, levels = (math.expm1(abs(mean)), math.exp(abs(mean)) * sigma), HALVES if mean >= 0 else HALVES[::-1]
-        shown = groups if vine or len(names) == 1 else ()
-        yield _tested(estimates.number, vine, "growth", levels, change, (p,), dof, rise.size, shown)
-
-
-def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
-    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2), linearised about each
-    trial's own B. About the common B, the between-trial scatter would enter in second order. What B does in the first
-    half is carried through the second as a shift in time, as where inertia is small.
-    """
-    halves = np.full((len(estimates.trials), 2), math.nan)
-    for i, (trial_data, columns) in enumerate(zip(fit.predictor.data, estimates.columns, strict=True)):
-        response, speed, residual = columns[:, DAMPING_DEVIATION], -columns[:, RELEASE], columns[:, -1]
-        growth = trial_data.lead_position_m - residual - estimates.trial_effects[i, ORIGIN]
-        middle = int(np.argmax(growth >= 0.5 * growth.max()))
-        if speed[middle] > 0 and response[middle] != 0:
-            first = response.copy()
-            first[middle:] = response[middle] * speed[middle:] / speed[middle]
-            design = np.column_stack([first, response - first, columns[:, estimates.nuisances[i]]])
-            halves[i] = np.linalg.lstsq(design, residual, rcond=1e-9)[0][:2]
-    return halves + estimates.trial_effects[:, [DAMPING_DEVIATION]]
+        ends, shown = HALVES if mean >= 0 else HALVES[::-1], groups if vine or len(names) == 1 else ()
+        yield _tested(subject, ends, _relative(mean, sigma), (p,), dof, rise.size, shown)
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
@@ -561,7 +543,6 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
         pulled_Pa, sigma_Pa = number.value - free.start, math.sqrt(variance)
         p = math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2))
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
-        levels, change = (free.start, number.value), (pulled_Pa, sigma_Pa)
-        yield _tested(
-            number, number.vine, "sheet", levels, change, (p,), math.inf, n_trials, stated_sigma_Pa=free.prior_sd
-        )
+        subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
+        change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
+        yield _tested(subject, levels, change, (p,), math.inf, n_trials, stated_sigma_Pa=stated)
