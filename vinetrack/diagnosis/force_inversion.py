@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.threads import njit
 from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
@@ -41,40 +40,6 @@ from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
 
 # ------------------------------------------------------------------------------
-# Compiled integration of the variational equations: responses of motions to small accelerations.
-
-
-@njit(nogil=True, error_model="numpy")
-def integrate_responses(
-    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
-) -> tuple[Floats, Floats]:
-    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
-    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
-    Anal. 14, 1006 (1977). Returns position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and
-    m/s. Shapes: time_s, stiffness, friction (n_trials, n_steps + 1); acceleration (n_trials, n_steps + 1, n).
-    """
-    trials, points, count = acceleration.shape
-    position_change, velocity_change = np.zeros_like(acceleration), np.zeros_like(acceleration)
-    for trial in range(trials):
-        for i in range(points - 1):
-            h = time_s[trial, i + 1] - time_s[trial, i]
-            implicit, explicit = gamma * h, (1 - gamma) * h
-            k, c = stiffness[trial, i + 1], friction[trial, i + 1]
-            k_stage = (1 - gamma) * stiffness[trial, i] + gamma * k
-            c_stage = (1 - gamma) * friction[trial, i] + gamma * c
-            pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
-            pivot = 1 - implicit * c - implicit * implicit * k
-            for j in range(count):
-                x, v, a = position_change[trial, i, j], velocity_change[trial, i, j], acceleration[trial, i + 1, j]
-                a_stage = (1 - gamma) * acceleration[trial, i, j] + gamma * a
-                rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
-                x, v = x + explicit * (v + implicit * rate), v + explicit * rate
-                v_end = v + implicit * ((k * (x + implicit * v) + c * v + a) / pivot)
-                position_change[trial, i + 1, j], velocity_change[trial, i + 1, j] = x + implicit * v_end, v_end
-    return position_change, velocity_change
-
-
-# ------------------------------------------------------------------------------
 # Motions, and the sensitivities of their positions to a small added force on the tail.
 #
 # Linearised about a motion x(t), the equation of motion m ẍ = F(x, ẋ, t) + f becomes the variational equation
@@ -85,8 +50,6 @@ def integrate_responses(
 # for them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`).
 
 N_STEPS = 400  # Steps of a motion, denser at its start (derived)
-
-SDIRK_GAMMA = 1 - 1 / math.sqrt(2)  # Diagonal coefficient of `integrate_responses` (derived)
 
 # Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
@@ -243,13 +206,32 @@ def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Flo
 
 def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:
     """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
-    time_s, k, c = (
-        np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction")
-    )
-    dx, dv = integrate_responses(time_s, k, c, np.array(accelerations), SDIRK_GAMMA)
-    # Compiled code does not raise on overflow.
-    if np.geterr()["over"] == "raise" and not (np.isfinite(dx).all() and np.isfinite(dv).all()):
-        raise FloatingPointError("the response to a force is not finite")
+    courses = (np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction"))
+    return integrate_responses(*courses, np.array(accelerations))
+
+
+def integrate_responses(
+    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats
+) -> tuple[Floats, Floats]:
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
+    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
+    Anal. 14, 1006 (1977). Returns changes of position, m, and velocity, m/s, (n_trials, n_times, n). Shapes: time_s,
+    stiffness, friction (n_trials, n_times); acceleration (n_trials, n_times, n).
+    """
+    gamma = 1 - 1 / math.sqrt(2)  # Its diagonal coefficient (derived)
+    courses = stiffness[:, :, None], friction[:, :, None], acceleration
+    dx, dv = np.zeros_like(acceleration), np.zeros_like(acceleration)
+    x, v = dx[:, 0], dv[:, 0]
+    for i, h in enumerate(np.diff(time_s).T[:, :, None]):
+        implicit, explicit = gamma * h, (1 - gamma) * h
+        k, c, a = (each[:, i + 1] for each in courses)
+        k_stage, c_stage, a_stage = ((1 - gamma) * each[:, i] + gamma * each[:, i + 1] for each in courses)
+        pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
+        rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
+        x, v = x + explicit * (v + implicit * rate), v + explicit * rate
+        v = v + implicit * ((k * (x + implicit * v) + c * v + a) / (1 - implicit * c - implicit * implicit * k))
+        x = x + implicit * v
+        dx[:, i + 1], dv[:, i + 1] = x, v
     return dx, dv
 
 

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -109,11 +111,6 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 
 
-def table_name(learned: LearnedForce) -> str:
-    """Name of the effect that holds a learned force, such as `learned_growth_speed`."""
-    return "_".join(["learned", *learned.domain.variables])
-
-
 def table_text(learned: LearnedForce, origin: str = "") -> str:
     """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
     worked example.
@@ -127,7 +124,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
     numbers = np.array2string(table, 110, separator=", ", threshold=table.size, formatter=digits)  # type: ignore[arg-type]
     return _source(
         str(remark("learned_file", learned=learned, origin=origin)),
-        constants=[f"TABLE = np.array({numbers})  # N\n"],
+        constants=f"TABLE = np.array({numbers})  # N\n\n",
         parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
         arguments={"a": 1.0},
         body=[*(line for k in range(len(domain.variables)) for line in _axis_code(domain, k)), *_sum_code(domain)],
@@ -139,7 +136,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
 
 def _source(
     docstring: str,
-    constants: Sequence[str],
+    constants: str,
     parameters: Sequence[str],
     arguments: Mapping[str, float],
     body: Sequence[str],
@@ -148,35 +145,39 @@ def _source(
     state: Mapping[str, float],
 ) -> str:
     """Source of an effect file with a tail force: the lines of its parts, and a worked example."""
-    parts = [
-        f'"""{docstring}"""\n',
-        "import numpy as np\n",
-        "from vinetrack.effects import Parameter, Worked\n",
-        *constants,
-        "PARAMETERS = (",
-        *(f"    {parameter}," for parameter in parameters),
-        ")\n\n",
-        f"def tail_force(s, rig, {', '.join(arguments)}):",
-        *(f"    {line}" for line in body),
-        "\n",
-        "WORKED = (",
-        "    Worked(",
-        '        "tail_force",',
-        f"        {worked_N:.8g},",
-        f'        "{how}",',
-        f"        state={state!r},",
-        f"        parameters={arguments!r},",
-        "    ),",
-        ")",
-    ]
-    return "\n".join(parts) + "\n"
+    lines = {name: "\n    ".join(part) for name, part in (("parameters", parameters), ("body", body))}
+    return f'''"""{docstring}"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter, Worked
+
+{constants}PARAMETERS = (
+    {lines["parameters"]}
+)
+
+
+def tail_force(s, rig, {", ".join(arguments)}):
+    {lines["body"]}
+
+
+WORKED = (
+    Worked(
+        "tail_force",
+        {worked_N:.8g},
+        "{how}",
+        state={state!r},
+        parameters={arguments!r},
+    ),
+)
+'''
 
 
 def _parameter(names: Sequence[str], value: str, bounds: Sequence[float], plausible: Sequence[float], more: str) -> str:
     """The line of a parameter of an effect file, of this name, symbol and unit."""
     quoted = ", ".join(f'"{name}"' for name in names)
     limits = ("({:.6g}, {:.6g})".format(*sorted(pair)) for pair in (bounds, plausible))
-    return "Parameter({}, {}, bounds={}, plausible={}, {})".format(quoted, value, *limits, more)
+    return "Parameter({}, {}, bounds={}, plausible={}, {}),".format(quoted, value, *limits, more)
 
 
 def _sum_code(domain: Domain) -> list[str]:
@@ -221,25 +222,17 @@ LEAST_SIGMAS = 6.0  # Standard deviations by which a force must improve the fit 
 
 
 @dataclass(frozen=True)
-class ProposedTable:
-    """A learned force that was fitted as an effect; `rms_left_out_m` is with the table learned from all trials."""
-
-    learned: LearnedForce
-    effect: Effect
-    ratio: LikelihoodRatio
-    rms_left_out_m: float
-
-
-@dataclass(frozen=True)
-class ProposedLaw:
-    """A law that was fitted as an effect. `rms_left_out_m` is its error on left-out conditions, m; NaN where the
-    likelihood of others is far higher.
+class Proposed:
+    """A law, or the learned force as a table, that was fitted as an effect. `text` is the source of its file, by where
+    it comes from. `rms_left_out_m` is its error on left-out conditions, m, of a table that was learned from all trials;
+    NaN where the likelihood of others is far higher.
     """
 
-    law: RankedLaw
+    words: str
+    text: Callable[[str], str]
     effect: Effect
     ratio: LikelihoodRatio
-    rms_left_out_m: float
+    rms_left_out_m: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -251,10 +244,10 @@ class Proposal:
 
     before: Fit
     rms_left_out_m: float
-    laws: tuple[ProposedLaw, ...]
-    tied: tuple[ProposedLaw, ...]
-    reason: Remark = field(default_factory=Remark)
-    table: ProposedTable | None = None
+    laws: tuple[Proposed, ...]
+    tied: tuple[Proposed, ...]
+    reason: Remark
+    table: Proposed | None
 
 
 @in_one_blas_thread
@@ -269,52 +262,54 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     # 4: most laws that are fitted in the equation of motion (chosen)
     best = [law for law in detected if law.explained > detected[0].explained - 0.2][:4]
     with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / f"proposed_{law.law.name}.py" for law in best]
-        effects = [_loaded(path, effect_text(law)) for path, law in zip(files, best, strict=True)]
-        if best:
-            before = _with_own_host(before, effects)
-        proposal = _fitted_laws(before, best, effects, report)
-        return replace(proposal, table=_fitted_table(proposal, force.learned, Path(folder), report))
+        before, laws = _fitted(before, best, Path(folder), report)
+        report("errors on left-out conditions")
+        error_m = left_out(before).rms_m
+        laws.sort(key=lambda law: -law.ratio.fit.log_likelihood)
+        laws = [
+            replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
+            if 2 * (laws[0].ratio.fit.log_likelihood - law.ratio.fit.log_likelihood) < OUT_OF_REACH
+            else law
+            for law in laws
+        ]
+        significant = [law for law in laws if law.rms_left_out_m < error_m and _explains(before, law.ratio)]
+        not_excluded = answer_set([law.ratio for law in significant])[0] if significant else []
+        tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
+        reason = Remark() if tied else remark("no_law_predicts_better" if best else "no_law_detected")
+        table = _table(before, [law.ratio.fit for law in tied], force.learned, Path(folder), report)
+    return Proposal(before, error_m, tuple(laws), tied, reason, table)
 
 
-def _with_own_host(fit: Fit, effects: Sequence[Effect]) -> Fit:
-    """The fit, compiled with these effects but without the catalogue, which is not needed here."""
-    return with_host(fit, Model((*fit.model, probe(), *effects)))
-
-
-def _loaded(path: Path, text: str) -> Effect:
-    path.write_text(text, encoding="utf-8")
-    remember(path)
-    return load_effect(path)
-
-
-def _fitted_laws(
-    before: Fit, laws: Sequence[RankedLaw], effects: Sequence[Effect], report: Callable[[str], None]
-) -> Proposal:
-    """The laws in order of their likelihood, with the significant ones that the data do not exclude."""
-    fitted = []
-    for law, effect in zip(laws, effects, strict=True):
-        try:
+def _fitted(
+    before: Fit, forces: Sequence[RankedLaw | LearnedForce], folder: Path, report: Callable[[str], None]
+) -> tuple[Fit, list[Proposed]]:
+    """Forces fitted as effects, and the fit without them, compiled with these effects but without the catalogue, which
+    is not needed here.
+    """
+    if not forces:
+        return before, []
+    files = [_file_of(force) for force in forces]
+    effects = []
+    for name, _, text in files:
+        path = folder / f"{name}.py"
+        path.write_text(text(""), encoding="utf-8")
+        remember(path)
+        effects.append(load_effect(path))
+    before, found = with_host(before, Model((*before.model, probe(), *effects))), []
+    for (_, words, text), effect in zip(files, effects, strict=True):
+        with suppress(FitError):
             ratio = likelihood_ratio(before, (effect,), fit_with(before, effect, report))
-        except FitError:
-            continue
-        fitted.append(ProposedLaw(law, effect, ratio, math.nan))
-    report("errors on left-out conditions")
-    error_m = left_out(before).rms_m
-    fitted.sort(key=lambda law: -law.ratio.fit.log_likelihood)
-    fitted = [
-        replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
-        if 2 * (fitted[0].ratio.fit.log_likelihood - law.ratio.fit.log_likelihood) < OUT_OF_REACH
-        else law
-        for law in fitted
-    ]
-    significant = [law for law in fitted if law.rms_left_out_m < error_m and _explains(before, law.ratio)]
-    if not significant:
-        reason = remark("no_law_predicts_better" if laws else "no_law_detected")
-        return Proposal(before, error_m, tuple(fitted), (), reason)
-    not_excluded, _ = answer_set([law.ratio for law in significant])
-    tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
-    return Proposal(before, error_m, tuple(fitted), tied)
+            found.append(Proposed(words, text, effect, ratio))
+    return before, found
+
+
+def _file_of(force: RankedLaw | LearnedForce) -> tuple[str, str, Callable[[str], str]]:
+    """Name of the effect that holds a force, such as `proposed_time` or `learned_growth_speed`, its description, and
+    the source of its file by where it comes from.
+    """
+    if isinstance(force, RankedLaw):
+        return f"proposed_{force.law.name}", force.words, partial(effect_text, force)
+    return "_".join(["learned", *force.domain.variables]), str(force.sentence), partial(table_text, force)
 
 
 def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
@@ -324,27 +319,23 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
     return ratio.sigma > LEAST_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
 
 
-def _fitted_table(
-    proposal: Proposal, learned: LearnedForce | None, folder: Path, report: Callable[[str], None]
-) -> ProposedTable | None:
+def _table(
+    before: Fit, laws: Sequence[Fit], learned: LearnedForce | None, folder: Path, report: Callable[[str], None]
+) -> Proposed | None:
     """The missing force as a smooth function, fitted as a table, where it explains what no law does."""
-    before, laws = proposal.before, [law.ratio.fit for law in proposal.tied]
     misfit = before.chi2_per_dof - 1
     remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
     # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
     if learned is None or misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
         return None
-    effect = _loaded(folder / f"{table_name(learned)}.py", table_text(learned))
-    try:
-        start = _with_own_host(before, [effect])
-        ratio = likelihood_ratio(start, (effect,), fit_with(start, effect, report))
-    except FitError:
-        return None
-    better = all(2 * (ratio.fit.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
-    if not (better and _explains(start, ratio)):
-        return None
-    report("errors with the table")
-    return ProposedTable(learned, effect, ratio, left_out(ratio.fit).rms_m)
+    start, tables = _fitted(before, [learned], folder, report)
+    for table in tables:
+        fit = table.ratio.fit
+        better = all(2 * (fit.log_likelihood - law.log_likelihood) > ANSWER_SET_DELTA_CHI2 for law in laws)
+        if better and _explains(start, table.ratio):
+            report("errors with the table")
+            return replace(table, rms_left_out_m=left_out(fit).rms_m)
+    return None
 
 
 # ------------------------------------------------------------------------------
@@ -372,11 +363,11 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
         *(_shape_parameter(shape[:3], value) for shape, value in zip(form.shapes, shapes, strict=True)),
     ]
     names = [form.size[0], *(shape.name for shape in form.shapes)]
-    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), []
+    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), ""
     if law.reference_area_m2:
         times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
         state["area"] = law.reference_area_m2
-        constants = [f"AREA = {law.reference_area_m2:.6g}  # m²\n"]
+        constants = f"AREA = {law.reference_area_m2:.6g}  # m²\n\n"
     worked_N = _force_N(detected)
     return _source(
         str(remark("law_file", law=detected.words, formula=formula, origin=origin)),

@@ -495,13 +495,13 @@ def proposal_lines(proposal: Proposal) -> list[str]:
     """Return which laws of force were fitted and what resulted, a line a sentence."""
     lines = []
     for law in proposal.laws if proposal.tied else ():
-        line = f"{law.law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
+        line = f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
         if math.isfinite(law.rms_left_out_m):
             errors_mm = 1e3 * proposal.rms_left_out_m, 1e3 * law.rms_left_out_m
             line += ", error on left-out conditions {:.2f} → {:.2f} mm".format(*errors_mm)
         lines.append(line + " (not excluded)" * (law in proposal.tied[1:]))
     if proposal.tied:
-        best, *others = [law.law.words for law in proposal.tied]
+        best, *others = [law.words for law in proposal.tied]
         lines.append(f"Proposed: {best}.")
         lines += [f"These data fit nearly as well with {joined(others)}."] if others else []
     else:
