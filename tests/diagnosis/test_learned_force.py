@@ -23,7 +23,7 @@ from vinetrack.effects import own_effects
 from vinetrack.inference import gaussian_processes as smooth
 from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
-GROWTH = learning.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
+GROWTH = learning.Domain((learning.Axis("growth", 0.0, 0.25, 12),))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
@@ -218,9 +218,9 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
 
 
 DOMAINS = [
-    learning.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
-    learning.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
-    learning.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 24),)),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8))),
+    learning.Domain((learning.Axis("time", 0.0, 0.4, 8), learning.Axis("pressure", 1e4, 3e4, 5))),
 ]
 
 
@@ -230,11 +230,8 @@ def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4, "is_visited": True}
     motion = SimpleNamespace(**{name: np.array([value]) for name, value in where.items()})
     motion.trial = SimpleNamespace(condition="one")
-    found, lengths = smooth.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
-    weights = {domain.name: 1.0}
-    return learning.LearnedForce(
-        domain, found, learning.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, True
-    )
+    found, weights = smooth.Posterior(*known, 50.0, 0, 0.1), {domain.name: 1.0}
+    return learning.LearnedForce(domain, found, [motion], weights, (), 50.0, 0.99, True)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
@@ -243,8 +240,8 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     path = tmp_path / "learned.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
     effect = own_effects([path])[path.stem]
-    draw, ends = np.random.default_rng(5), zip(domain.low, domain.high, strict=True)
-    at = [draw.uniform(low - 0.1 * (high - low), high * 1.2, 40) for low, high in ends]
+    draw = np.random.default_rng(5)
+    at = [draw.uniform(axis.low - 0.1 * (axis.high - axis.low), axis.high * 1.2, 40) for axis in domain.axes]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
     expected = domain.basis(at) @ force.found.mean

@@ -206,8 +206,8 @@ def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Flo
 
 def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:
     """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
-    courses = (np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction"))
-    return integrate_responses(*courses, np.array(accelerations))
+    time_s, k, c = (np.array([getattr(each, name) for each in motions]) for name in ("time_s", "stiffness", "friction"))
+    return integrate_responses(time_s, k, c, np.array(accelerations))
 
 
 def integrate_responses(

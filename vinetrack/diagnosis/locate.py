@@ -74,9 +74,25 @@ class Failure:
         together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * p.size))
         return bool(p.min() < level / p.size or together < level)
 
-    def remarks(self) -> tuple[Remark, ...]:
+    def remarks(self) -> Iterator[Remark]:
         """Where the model fails most, by how much, and what drifts."""
-        return (*_where(self.by_condition, self.fails, self.pressure_unit), *self.drift.remarks)
+        table = self.by_condition
+        known = table[np.isfinite(table["worst_residual_m"])] if self.fails else table.sort_values("z", ascending=False)
+        worst = known.iloc[0]
+        # What names a condition: its pressure, and payload and vine where they vary
+        varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
+        condition = {"unit": self.pressure_unit} | {name: worst[name] for name in ("pressure_Pa", *varying)}
+        if self.fails:
+            numbers = {
+                name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")
+            }
+            yield remark("fails_most", condition=condition, **numbers)
+            # 2.0: significance, in standard deviations, from which it is said to fail in a condition
+            count = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum())
+            yield remark("fails_in", count=count, total=len(table))
+        else:
+            yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=condition)
+        yield from self.drift.remarks
 
 
 def locate(fit: Fit) -> Failure:
@@ -85,26 +101,36 @@ def locate(fit: Fit) -> Failure:
 
     courses, predicted = residual_courses(fit)
     scatter, together = replicate_scatter(fit, courses), replicates_by_condition(predicted)
-    conditions = by_condition(courses)
-    rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in conditions.items()]
-    in_time = [(of, common_edges(of), name) for name, of in conditions.items()]
+    rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in by_condition(courses).items()]
     return Failure(
         pressure_unit=predicted[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_time=_table("time_s", "s", in_time, scatter),
-        along_position=_table("lead_position_m", "m", _parts("lead_position_m", courses), scatter),
-        along_speed=_table("lead_velocity_m_s", "m_s", _parts("lead_velocity_m_s", courses), scatter),
+        along_time=_table("time_s", "s", courses, scatter),
+        along_position=_table("lead_position_m", "m", courses, scatter),
+        along_speed=_table("lead_velocity_m_s", "m_s", courses, scatter),
         scatter=scatter,
         drift=drift(fit),
     )
 
 
 def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter) -> dict[str, object]:
+    """Errors of a condition, and by a normal deviate whether between-trial scatter explains stretch means as large. The
+    test statistic is the mean square of the deviates, with the effective degrees of freedom of Satterthwaite's
+    approximation, because stretches are correlated.
+    """
+    from scipy.stats import chi2, norm
+    from scipy.stats import f as fisher
+
     errors, trial, count = position_errors(together), together.trials[0].trial, len(together.trials)
     covariance = scatter.covariance(stretches.response_m, stretches.noise_m2)
-    mean_m, sigma_m = stretches.means_m.mean(axis=0), np.sqrt(np.diag(covariance) / count)
+    mean_m, sd_m = stretches.means_m.mean(axis=0), np.sqrt(np.diag(covariance))
+    z, worst_m, sigma_m = 0.0, math.nan, math.nan
     # Replicates without enough frames at common times have no stretch means.
-    worst = int(np.argmax(np.abs(mean_m))) if mean_m.size else None
+    if mean_m.size:
+        worst, square = int(np.argmax(np.abs(mean_m))), float(np.mean(count * (mean_m / sd_m) ** 2))
+        degrees = mean_m.size**2 / float(np.sum((covariance / sd_m[:, None] / sd_m) ** 2))
+        p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
+        z, worst_m, sigma_m = norm.isf(max(p, 1e-300)), mean_m[worst], sd_m[worst] / math.sqrt(count)
     return {
         "vine": trial.vine,
         "condition": trial.condition,
@@ -115,53 +141,36 @@ def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter)
         "floor_m": errors["replicate_floor_m"],
         "ratio": errors["ratio"],
         "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
-        "z": _replicate_z(mean_m / sigma_m, covariance, scatter) if mean_m.size else 0.0,
+        "z": float(z),
         "worst_at_s": errors["worst_at_s"],
         "worst_at_m": errors["worst_at_m"],
-        "worst_residual_m": math.nan if worst is None else float(mean_m[worst]),
-        "worst_sigma_m": math.nan if worst is None else float(sigma_m[worst]),
+        "worst_residual_m": float(worst_m),
+        "worst_sigma_m": float(sigma_m),
     }
 
 
-def _replicate_z(deviates: Floats, covariance: Floats, scatter: Scatter) -> float:
-    """Test whether between-trial scatter explains stretch means as large as observed; the p-value as a normal deviate.
-    The test statistic is the mean square of the deviates, with the effective degrees of freedom of Satterthwaite's
-    approximation, because stretches are correlated. Shapes: deviates (n,); covariance (n, n).
+def _table(along: str, unit: str, courses: Sequence[ResidualCourse], scatter: Scatter) -> pd.DataFrame:
+    """Mean residual of every stretch over the trials that reach it, with its standard error: in stretches of time that
+    every replicate of a condition was recorded in, or of the growth or speed of a vine, whose trials are also averaged
+    together (condition blank).
     """
-    from scipy.stats import chi2, norm
-    from scipy.stats import f as fisher
+    import pandas as pd
 
-    sigma, square = np.sqrt(np.diag(covariance)), float(np.mean(deviates**2))
-    degrees = deviates.size**2 / float(np.sum((covariance / sigma[:, None] / sigma) ** 2))
-    p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
-    return float(norm.isf(max(p, 1e-300)))
-
-
-Part = tuple[Sequence[ResidualCourse], Floats, str]
-
-
-def _parts(along: str, courses: Sequence[ResidualCourse]) -> list[Part]:
-    """Trials to average in stretches of so many edges: those of each condition, and all of a vine together (blank)."""
-    parts: list[Part] = []
-    for vine in dict.fromkeys(course.trial.vine for course in courses):
+    parts: list[tuple[Sequence[ResidualCourse], Floats, str]] = []
+    if along == "time_s":
+        parts = [(of, common_edges(of), name) for name, of in by_condition(courses).items()]
+    for vine in dict.fromkeys(course.trial.vine for course in courses) if not parts else ():
         members = [course for course in courses if course.trial.vine == vine]
         edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
         parts += [(of, edges, name) for name, of in (*by_condition(members).items(), ("", members))]
-    return parts
-
-
-def _table(along: str, unit: str, parts: Sequence[Part], scatter: Scatter) -> pd.DataFrame:
-    """Mean residual of every stretch over the trials that reach it, with its standard error."""
-    import pandas as pd
-
     rows: list[tuple[object, ...]] = []
-    for members, edges, condition in parts:
-        in_stretches = [member.means(along, edges) for member in members]
+    for of_part, edges, condition in parts:
+        in_stretches = [member.means(along, edges) for member in of_part]
         means_m = np.array([means for means, _ in in_stretches])
         variances = np.array(
             [
                 np.diag(scatter.covariance(np.nan_to_num(means[:, 1:]), member.noise(count)))
-                for member, (means, count) in zip(members, in_stretches, strict=True)
+                for member, (means, count) in zip(of_part, in_stretches, strict=True)
             ]
         )
         present = np.isfinite(means_m).all(axis=2)
@@ -171,29 +180,9 @@ def _table(along: str, unit: str, parts: Sequence[Part], scatter: Scatter) -> pd
             mean_m = float(means_m[reached, k, 0].mean())
             sigma_m = math.sqrt(float(variances[reached, k].sum())) / count
             middle = (low + high) / 2
-            rows.append((members[0].trial.vine, condition, low, high, middle, mean_m, sigma_m, mean_m / sigma_m, count))
+            rows.append((of_part[0].trial.vine, condition, low, high, middle, mean_m, sigma_m, mean_m / sigma_m, count))
     columns = ("vine", "condition", f"from_{unit}", f"to_{unit}", along, "mean_residual_m", "sigma_m", "z", "n_trials")
     return pd.DataFrame(rows, columns=list(columns))
-
-
-def _where(table: pd.DataFrame, fails: bool, unit: str) -> Iterator[Remark]:
-    """Remarks about conditions; the table has the worst first."""
-    if not fails:
-        worst = table.sort_values("z").iloc[-1]
-        yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=_named(worst, table, unit))
-        return
-    worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
-    numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")}
-    yield remark("fails_most", condition=_named(worst, table, unit), **numbers)
-    # 2.0: significance, in standard deviations, from which it is said to fail in a condition
-    count, total = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum()), len(table)
-    yield remark("fails_in", count=count, total=total)
-
-
-def _named(row: pd.Series, table: pd.DataFrame, unit: str) -> dict[str, object]:
-    """What names a condition: its pressure, and payload and vine where they vary."""
-    varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
-    return {"unit": unit} | {name: row[name] for name in ("pressure_Pa", *varying)}
 
 
 # ------------------------------------------------------------------------------
@@ -246,7 +235,12 @@ def drift(fit: Fit) -> Drift:
     """Test B for drift with pressure, payload, angle, chamber, inlet or along the growth, and P_y against the sheet."""
     import pandas as pd
 
-    tests = sorted(_tests(fit), key=lambda tested: tested.p)
+    tests: list[ConstancyTest] = []
+    if DAMPING in fit.predictor.layout.keys:
+        estimates = per_trial_estimates(fit, align_trials(fit))
+        tests += [test for against in COVARIATES for test in _against(estimates, against)]
+        tests += _along_growth(estimates)
+    tests = sorted([*tests, *against_the_sheet(fit)], key=lambda tested: tested.p)
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]
@@ -276,15 +270,6 @@ class ConstancyTest:
     row: dict[str, object]
     p: float
     groups: Sequence[dict[str, object]]
-
-
-def _tests(fit: Fit) -> Iterator[ConstancyTest]:
-    if DAMPING in fit.predictor.layout.keys:
-        estimates = per_trial_estimates(fit, align_trials(fit))
-        for against in COVARIATES:
-            yield from _against(estimates, against)
-        yield from _along_growth(estimates)
-    yield from against_the_sheet(fit)
 
 
 def _subject(number: Number, vine: str, against: str) -> dict[str, object]:

@@ -67,17 +67,36 @@ ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anyt
 LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
 
 
+# Variables taken as logarithms over most of their range, from 1 to 1 + 3 (chosen): speeds and durations of a campaign
+# span decades, and forces change over fractions of them
+LOGARITHMIC, LOG_RATIO = ("speed", "time"), 3.0
+
+# Splines along a variable, when it is alone and when it is one of two (chosen)
+SPLINES = {"growth": (24, 20), "speed": (16, 8), "time": (16, 8), "pressure": (7, 5)}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A variable of a force, the range that was visited, SI, and the number of splines along it."""
+
+    name: str
+    low: float
+    high: float
+    count: int
+
+    def part(self, at: Floats) -> Floats:
+        """The variable scaled to 0 to 1 over the visited range. Shapes: at (n,) → (n,)."""
+        part = (at - self.low) / (self.high - self.low)
+        if self.name in LOGARITHMIC:
+            part = np.log1p(LOG_RATIO * np.maximum(part, 0.0)) / math.log1p(LOG_RATIO)
+        return np.asarray(part)
+
+
 @dataclass(frozen=True)
 class Domain:
-    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
-    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
-    """
+    """The variables of a force, one or two."""
 
-    variables: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    counts: tuple[int, ...]
-    log_scale: tuple[float, ...]
+    axes: tuple[Axis, ...]
 
     @property
     def name(self) -> str:
@@ -85,21 +104,19 @@ class Domain:
         return "+".join(self.variables)
 
     @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables."""
+        return tuple(axis.name for axis in self.axes)
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of splines along the variables."""
+        return tuple(axis.count for axis in self.axes)
+
+    @property
     def start_axis(self) -> int:
         """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
         return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
-
-    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
-        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
-        """
-        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
-        return [
-            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
-            if math.isfinite(log_scale)
-            else (at - low) / (high - low)
-            for at, low, high, log_scale in limits
-        ]
 
     def values_along(self, motion: FittedMotion) -> list[Floats]:
         """The variables along a motion, SI, each of shape (n_times,)."""
@@ -107,15 +124,10 @@ class Domain:
 
     def basis(self, values: Sequence[Floats]) -> Floats:
         """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, n_splines)."""
-        first, *others = [splines(at, count) for at, count in zip(self.normalised(values), self.counts, strict=True)]
+        first, *others = [splines(axis.part(at), axis.count) for axis, at in zip(self.axes, values, strict=True)]
         for other in others:
             first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
         return first
-
-    def force(self, found: Posterior, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
-        basis = self.basis(values)
-        return basis @ found.mean, standard_error(basis, found.covariance)
 
     def unit_push(self, motion: FittedMotion) -> Floats:
         """The splines along a motion, shape (n_times, n_splines)."""
@@ -124,17 +136,14 @@ class Domain:
     @property
     def hypotheses(self) -> list[tuple[str, tuple[float, ...]]]:
         """What the force may be where growth begins, with every combination of length scales."""
-        starts = list(LOG_ODDS) if len(self.variables) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
-        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.variables))
+        starts = list(LOG_ODDS) if len(self.axes) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
+        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.axes))
         return list(itertools.product(starts if self.start_axis >= 0 else [FREE_AT_START], lengths))
 
     def modes(self, at_start: str, lengths: Sequence[float]) -> Floats:
         """Square root of the covariance of the coefficients at unit amplitude, shape (n_splines, n_modes)."""
         start = self.start_axis
-        roots = [
-            root_of_covariance(count, length, k == start)
-            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
-        ]
+        roots = [root_of_covariance(*each, k == start) for k, each in enumerate(zip(self.counts, lengths, strict=True))]
         modes = [product_of_modes(roots)]
         if at_start == CONSTANT_AT_START:
             modes.append(np.ones((math.prod(self.counts), 1)))
@@ -147,8 +156,7 @@ class Domain:
 
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     """Every variable alone, then every pair, over the ranges that the motions visit."""
-    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
-    ranges: dict[str, tuple[float, float, float]] = {}
+    ranges: dict[str, tuple[float, float]] = {}
     for name, attribute in VARIABLES.items():
         by_trial = [np.asarray(getattr(motion, attribute))[motion.is_visited] for motion in motions]
         # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
@@ -156,20 +164,55 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
         # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
         if high - low > 0.02 * abs(high):
-            if name == "pressure":
-                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
-            typical = float(np.median([np.median(values) for values in by_trial]))
-            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
-            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
-    # Splines along a variable, when it is alone and when it is one of two (chosen)
-    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-    domains = []
-    for names in (*((name,) for name in ranges), *itertools.combinations(ranges, 2)):
-        counts = tuple((alone if len(names) == 1 else in_pair)[name] for name in names)
-        lows, highs, scales = zip(*(ranges[name] for name in names), strict=True)
-        domains.append(Domain(names, lows, highs, counts, scales))
-    return domains
+            # 0.03: part by which the range of pressures is extended at both ends (chosen)
+            ranges[name] = (0.97 * low, 1.03 * high) if name == "pressure" else (low, high)
+    choices = [*((name,) for name in ranges), *itertools.combinations(ranges, 2)]
+    return [
+        Domain(tuple(Axis(name, *ranges[name], SPLINES[name][len(names) - 1]) for name in names)) for names in choices
+    ]
+
+
+@dataclass(frozen=True)
+class SmoothForce:
+    """A force over some variables: the posterior of its coefficients, N, and the motions of the trials under it."""
+
+    domain: Domain
+    found: Posterior
+    motions: Sequence[FittedMotion]
+
+    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.domain.basis(values)
+        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The force on a grid of its variables (condition blank), with the number of trials that visited each point,
+        and along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
+        """
+        import pandas as pd
+
+        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+        axes, names = self.domain.axes, [VARIABLES[name] for name in self.domain.variables]
+        ends = [np.linspace(axis.low, axis.high, plot_points[len(axes) - 1]) for axis in axes]
+        grid = [values.ravel() for values in np.meshgrid(*ends, indexing="ij")]
+        trials = np.zeros(grid[0].size, dtype=int)
+        parts = {"": dict(zip(names, grid, strict=True))}
+        for motion in self.motions:
+            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+            for axis, at, course in zip(axes, grid, self.domain.values_along(motion), strict=True):
+                near &= np.abs(axis.part(at)[:, None] - axis.part(course)) < visited_distance
+            trials += near.any(axis=1)
+            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+            along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
+            parts.setdefault(motion.trial.condition, along)
+        tables = []
+        for condition, values in parts.items():
+            force_N, sigma_N = self.force([values[name] for name in names])
+            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
+            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+            tables.append(pd.DataFrame(columns | {"condition": condition}))
+        return pd.concat(tables, ignore_index=True)
 
 
 # ------------------------------------------------------------------------------
@@ -186,26 +229,16 @@ LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is es
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A force over some variables. `equations` are those of its coefficients, `best` their least squares without regard
-    to how smooth the force is, `found` their posterior.
-    """
+class Choice(SmoothForce):
+    """A force over some variables, the equations of its coefficients, and their least squares whether smooth or not."""
 
-    domain: Domain
     equations: ForceEquations
     best: ForceEstimate
-    found: Posterior
 
     @property
     def least_chi2(self) -> float:
         """χ² of the best coefficients."""
         return self.equations.chi2 - self.best.delta_chi2
-
-
-def amplitudes_N(motions: Sequence[FittedMotion]) -> Floats:
-    """Amplitudes of forces that are averaged over, N."""
-    drive_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
-    return drive_N * np.geomspace(0.003, 0.3, 9)  # Parts of the largest drive (chosen)
 
 
 def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
@@ -214,8 +247,10 @@ def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
     equations = [ForceEquations(problem, point, domain.unit_push) for domain in domains]
     best = [each.estimate() for each in equations]
     inflation = problem.inflation(min(e.chi2 - b.delta_chi2 for e, b in zip(equations, best, strict=True)))
-    found = [coefficients_of(*each, inflation) for each in zip(domains, equations, strict=True)]
-    return [Choice(*each) for each in zip(domains, equations, best, found, strict=True)]
+    return [
+        Choice(domain, coefficients_of(domain, each, inflation), point.motions, each, estimate)
+        for domain, each, estimate in zip(domains, equations, best, strict=True)
+    ]
 
 
 def _least_chi2(choices: Sequence[Choice]) -> float:
@@ -224,11 +259,13 @@ def _least_chi2(choices: Sequence[Choice]) -> float:
 
 def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float) -> Posterior:
     """The posterior of the coefficients over a domain, their noise variance inflated."""
+    drives_N = (np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2 / 2 for motion in equations.point.motions)
+    amplitudes_N = max(float(np.max(drive_N)) for drive_N in drives_N) * np.geomspace(0.003, 0.3, 9)  # (chosen)
     return posterior(
         equations.information / inflation,
         (equations.score + equations.information @ equations.coefficients) / inflation,
         [domain.modes(*each) for each in domain.hypotheses],
-        amplitudes_N(equations.point.motions),
+        amplitudes_N,
         [LOG_ODDS[at_start] for at_start, _ in domain.hypotheses],
     )
 
@@ -246,30 +283,19 @@ def variable_weights(log_evidence: Mapping[str, float], unit: float = 1.0) -> di
 
 
 @dataclass(frozen=True)
-class LearnedForce:
-    """The missing force over the variables that it most likely depends on: the posterior of its coefficients, N, and
-    the most likely of the hypotheses that this averages over. `motions` are those of the trials at the solution.
-    """
+class LearnedForce(SmoothForce):
+    """The missing force over the variables that it most likely depends on."""
 
-    domain: Domain
-    found: Posterior
-    at_start: str
-    length_scales: tuple[float, ...]
-    motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
     not_excluded: tuple[str, ...]
     log_bayes_factor: float
     explained: float
     is_repeated: bool
 
-    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
-        return self.domain.force(self.found, values)
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The force on a grid, and along the first trial of each condition."""
-        return force_table(self.domain, self.found, self.motions)
+    @property
+    def likeliest(self) -> tuple[str, tuple[float, ...]]:
+        """What the force is where growth begins, and its length scales: the most likely of those averaged over."""
+        return self.domain.hypotheses[self.found.hypothesis]
 
     @property
     def visited(self) -> pd.DataFrame:
@@ -285,7 +311,7 @@ class LearnedForce:
             name=self.domain.name,
             weights=self.weights,
             alternatives=self.not_excluded,
-            begins=self.at_start if self.domain.start_axis >= 0 else "",
+            begins=self.likeliest[0] if self.domain.start_axis >= 0 else "",
             range_N=(float(force_N.min()), float(force_N.max())),
             sigma_N=float(self.visited["sigma_N"].median()),
             explained=self.explained,
@@ -295,56 +321,26 @@ class LearnedForce:
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
+        at_start, length_scales = self.likeliest
         return {
             "variables": list(self.domain.variables),
             "weights": dict(self.weights),
             "not_excluded": list(self.not_excluded),
-            "length_scales": dict(zip(self.domain.variables, self.length_scales, strict=True)),
+            "length_scales": dict(zip(self.domain.variables, length_scales, strict=True)),
             "amplitude_N": self.found.amplitude,
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": self.at_start,
+            "begins": at_start,
             "sentence": str(self.sentence),
         }
 
 
-def force_table(domain: Domain, found: Posterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
-    """A force on a grid of its variables (condition blank), with the number of trials that visited each point, and
-    along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
-    """
-    import pandas as pd
-
-    plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-    axes = [
-        np.linspace(low, high, plot_points[len(domain.variables) - 1])
-        for low, high in zip(domain.low, domain.high, strict=True)
-    ]
-    grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
-    trials = np.zeros(grid[0].size, dtype=int)
-    parts = {"": dict(zip((VARIABLES[name] for name in domain.variables), grid, strict=True))}
-    for motion in motions:
-        near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
-        for at, course in zip(domain.normalised(grid), domain.normalised(domain.values_along(motion)), strict=True):
-            near &= np.abs(at[:, None] - course) < visited_distance
-        trials += near.any(axis=1)
-        points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
-        along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
-        parts.setdefault(motion.trial.condition, along)
-    tables = []
-    for condition, values in parts.items():
-        force_N, sigma_N = domain.force(found, [values[VARIABLES[name]] for name in domain.variables])
-        columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
-        columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
-        tables.append(pd.DataFrame(columns | {"condition": condition}))
-    return pd.concat(tables, ignore_index=True)
-
-
-def learned_force(
-    problem: ForceProblem, choices: Sequence[Choice], misfit: float, log_bayes_factors: Mapping[str, float]
-) -> LearnedForce | None:
+def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Sequence[Choice]) -> LearnedForce | None:
     """The missing force over the variables of the highest marginal likelihood, where it explains the misfit: χ² beyond
-    the number of points, as the evidence against no force, seen from the tracks.
+    the number of points, as the evidence against no force, as first seen from the tracks.
     """
+    misfit = first[0].equations.chi2 - problem.n_points
+    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in first}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
     if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
         return None
@@ -370,13 +366,10 @@ def learned_force(
         )
     ]
     others.sort(key=lambda name: -weights[name])
-    at_start, lengths = domain.hypotheses[best.found.hypothesis]
     return LearnedForce(
         domain=domain,
         found=best.found,
-        at_start=at_start,
-        length_scales=lengths,
-        motions=equations.point.motions,
+        motions=best.motions,
         weights=weights,
         not_excluded=tuple(others),
         log_bayes_factor=log_bayes_factors[domain.name],
@@ -493,7 +486,7 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 @dataclass(frozen=True)
 class MissingForce:
-    """What is missing, as a force on the tail, N. `table` is that over its most likely variables, see `force_table`."""
+    """What is missing, as a force on the tail, N. `table` is that of its most likely variables."""
 
     table: pd.DataFrame
     laws: pd.DataFrame
@@ -527,10 +520,8 @@ def missing_force(fit: Fit) -> MissingForce:
     first = choices = choices_seen_from(problem, problem.start)
     learned = None
     with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
-        misfit = choices[0].equations.chi2 - problem.n_points
-        log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in choices}
-        choices = choices_seen_from(problem, _under_best(problem, choices))
-        learned = learned_force(problem, choices, misfit, log_bayes_factors)
+        choices = choices_seen_from(problem, _under_best(problem, first))
+        learned = learned_force(problem, first, choices)
     choices = min(first, choices, key=_least_chi2)
     point, chi2 = choices[0].equations.point, choices[0].equations.chi2
     laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
@@ -542,9 +533,9 @@ def missing_force(fit: Fit) -> MissingForce:
     beyond_noise = chi2 - problem.n_points
     # NaN where the misfit hardly exceeds the noise
     reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
-    drawn = max(choices, key=lambda choice: choice.found.log_evidence) if learned is None else learned
+    drawn = learned or max(choices, key=lambda choice: choice.found.log_evidence)
     return MissingForce(
-        table=force_table(drawn.domain, drawn.found, point.motions),
+        table=drawn.table,
         laws=_law_table(laws),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),

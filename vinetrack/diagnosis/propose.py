@@ -37,7 +37,10 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misf
 from vinetrack.diagnosis.missing_force import (
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
+    LOG_RATIO,
+    LOGARITHMIC,
     VARIABLES,
+    Axis,
     Domain,
     LearnedForce,
     RankedLaw,
@@ -127,7 +130,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
         constants=f"TABLE = np.array({numbers})  # N\n\n",
         parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
         arguments={"a": 1.0},
-        body=[*(line for k in range(len(domain.variables)) for line in _axis_code(domain, k)), *_sum_code(domain)],
+        body=[*(line for k, axis in enumerate(domain.axes) for line in _axis_code(axis, k)), *_sum_code(domain)],
         worked_N=worked_N,
         how="the learned force at this state",
         state={_STATE[name]: value for name, value in at.items()},
@@ -191,16 +194,14 @@ def _sum_code(domain: Domain) -> list[str]:
     return [*rows, "return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
 
 
-def _axis_code(domain: Domain, k: int) -> list[str]:
+def _axis_code(axis: Axis, k: int) -> list[str]:
     """Lines of code that find the interval of the table in which a state lies, and the four nonzero splines there."""
-    low, high, log_scale, steps = domain.low[k], domain.high[k], domain.log_scale[k], domain.counts[k] - 3
-    at, step, weight = "uv"[k], "ij"[k], "fg"[k]
-    state = f"s.{_STATE[domain.variables[k]]}"
-    from_low = f"({state} - {_code_number(low)})" if low else state
-    position = f"np.minimum(np.maximum({from_low} / {_code_number(high - low)}, 0.0), 1.0)"
-    if math.isfinite(log_scale):
-        ratio = (high - low) / log_scale
-        position = f"np.log1p({_code_number(ratio)} * {position}) / {_code_number(math.log1p(ratio))}"
+    at, step, weight, steps = "uv"[k], "ij"[k], "fg"[k], axis.count - 3
+    state = f"s.{_STATE[axis.name]}"
+    from_low = f"({state} - {_code_number(axis.low)})" if axis.low else state
+    position = f"np.minimum(np.maximum({from_low} / {_code_number(axis.high - axis.low)}, 0.0), 1.0)"
+    if axis.name in LOGARITHMIC:
+        position = f"np.log1p({LOG_RATIO} * {position}) / {_code_number(math.log1p(LOG_RATIO))}"
     return [
         f"{at} = {steps}.0 * {position}",
         f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",

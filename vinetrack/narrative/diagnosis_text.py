@@ -526,8 +526,9 @@ def learned_file_text(learned: LearnedForce, origin: str) -> str:
     shown = {"growth": ("y", "mm", 1e3), "speed": ("ẋ", "m/s", 1.0), "time": ("t", "ms", 1e3),
              "pressure": ("P", "kPa", 1e-3)}  # fmt: skip
     ranges = [
-        f"{_variables_text(name)} from {low * shown[name][2]:.3g} to {high * shown[name][2]:.3g} {shown[name][1]}"
-        for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
+        f"{_variables_text(axis.name)} from {axis.low * times:.3g} to {axis.high * times:.3g} {unit}"
+        for axis in domain.axes
+        for _, unit, times in [shown[axis.name]]
     ]
     validity = sentence("valid_where_learned", {"ranges": ranges})
     symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))
