@@ -15,7 +15,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis import force_inversion as inversion
 from vinetrack.diagnosis import force_laws as laws
 from vinetrack.diagnosis import missing_force as learning
-from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
+from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_text
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
@@ -120,7 +120,7 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
 
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
-    slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
+    slowed = inversion.ForceProblem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks, theta = slowed.start, slowed.start.theta
     domains = learning.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, replicate_scatter, residual_courses
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, root_of_covariance, splines, whiten
@@ -115,7 +115,26 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
         for trial_data, job in zip(predictor.data, jobs, strict=True)
     ]
     runs = simulate_many(fit.model, trials, grids, traces=traces, parameters=jobs.row, host=predictor.host)
-    return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
+    motions = []
+    for trial, job, run, trace in zip(trials, jobs, runs, traces, strict=True):
+        model = fit.model.with_values(dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True)))
+        y, v = run.lead_position_m, run.lead_velocity_m_s
+        measured = None if trace is None else np.interp(run.time_s, *trace)
+        if measured is None and any("chamber_rate" in effect.functions for effect in model):
+            # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher
+            # order.
+            measured = evaluate(model, trial, run.time_s, y, v).pressure_Pa
+        # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
+        velocity = np.gradient(y, run.time_s)
+        moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
+        by_time = np.gradient(run.observed_position_m, run.time_s)
+        slope, nothing = np.where(moving, by_time / np.where(moving, velocity, 1.0), 1.0), np.zeros_like(y)
+        offset_m, terms = run.observed_position_m - y, [nothing] * 5  # Terms are evaluated next
+        motion = with_terms(
+            FittedMotion(trial, model, measured, run.time_s, y, v, nothing, slope, offset_m, math.inf, *terms)
+        )
+        motions.append(replace(motion, acceleration=motion.model_acceleration))
+    return motions
 
 
 def _trial_of_job(trial: Trial, job: Jobs) -> Trial:
@@ -123,30 +142,6 @@ def _trial_of_job(trial: Trial, job: Jobs) -> Trial:
     yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
     pressure_Pa = trial.pressure_Pa * (1 + float(job.pressure_deviation))
     return replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
-
-
-def _motion(
-    model: Model, trial: Trial, job: Jobs, run: Trajectory, trace: tuple[Floats, Floats] | None
-) -> FittedMotion:
-    model = model.with_values(dict(zip(model.parameter_names, job.row.tolist(), strict=True)))
-    measured = None if trace is None else np.interp(run.time_s, *trace)
-    if measured is None and any("chamber_rate" in effect.functions for effect in model):
-        # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher order.
-        measured = evaluate(model, trial, run.time_s, run.lead_position_m, run.lead_velocity_m_s).pressure_Pa
-    # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
-    velocity = np.gradient(run.lead_position_m, run.time_s)
-    moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
-    slope = np.where(moving, np.gradient(run.observed_position_m, run.time_s) / np.where(moving, velocity, 1.0), 1.0)
-    zeros = np.zeros_like(run.time_s)
-    motion = with_terms(
-        FittedMotion(
-            trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros, slope,
-            run.observed_position_m - run.lead_position_m,
-            counts_until_s=math.inf,
-            pressure_Pa=zeros, mass_kg=zeros, model_acceleration=zeros, stiffness=zeros, friction=zeros,
-        )
-    )  # fmt: skip
-    return replace(motion, acceleration=motion.model_acceleration)
 
 
 def _accelerated(motion: FittedMotion, push: Push | None) -> tuple[FittedMotion, Floats]:
@@ -331,13 +326,15 @@ class ForceProblem:
     the tracks, whatever the model says.
     """
 
-    def __init__(self, fit: Fit, scatter: Scatter) -> None:
-        self.fit, self.data, self.scatter = fit, fit.predictor.data, scatter
+    def __init__(self, fit: Fit) -> None:
+        self.fit, self.data = fit, fit.predictor.data
+        self.scatter = replicate_scatter(fit, residual_courses(fit)[0])
         self.prior = fit.solution.problem
         self.rho = track_correlation(self.data)
         noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - self.rho**2)
         self.variance = np.maximum(noise, variance_floor(self.data))
-        spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
+        least, scatter = LEAST_BETWEEN_TRIAL_SD, self.scatter
+        spread = (max(scatter.pressure, least[0]), max(scatter.damping, least[1]))
         state = replace(fit.solution.state, spread=spread)
         self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
         # A parameter without prior and information stays where it is.

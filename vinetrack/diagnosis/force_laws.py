@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import FittedMotion
 
@@ -56,11 +55,6 @@ class Law:
         return self.n_amplitudes + self.n_shapes + bool(self.factor)
 
     @property
-    def depends_on_pressure(self) -> bool:
-        """Whether it changes with the pressure."""
-        return "pressure" in (self.kind, self.factor)
-
-    @property
     def is_unresolved(self) -> bool:
         """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
         # 1e-3: least width of a local force that is reported (chosen)
@@ -74,10 +68,6 @@ class Law:
         phases = [self.shapes, (*self.shapes[:1], math.pi / 2)][: self.n_amplitudes]
         force = np.column_stack([FORMS[self.kind].along(motion, shapes) for shapes in phases])
         return size * (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force)
-
-    def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
-        """Describe the law with its size."""
-        return str(remark("law", law=self, amplitude_N=amplitude_N, sigma_N=sigma_N))
 
 
 # States of a motion by their names in an effect file
@@ -198,7 +188,7 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
     if max(areas) > 1.02 * min(areas):
         mean_m2 = float(np.mean(areas))
-        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if not law.depends_on_pressure]
+        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in (law.kind, law.factor)]
     return _with_unit_peak(laws, motions)
 
 

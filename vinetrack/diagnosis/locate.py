@@ -353,19 +353,16 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
     trial_effects, columns = aligned.trial_effects.copy(), aligned.columns
     # 0.3, 2.0: largest step of ln B, and of the release, frames (chosen)
     limits = {DAMPING_DEVIATION: 0.3, ORIGIN: math.inf}
-    try:
-        # 5: Gauss–Newton steps (chosen)
-        for _ in range(5):
-            for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
-                free = [DAMPING_DEVIATION, *others]
-                most = [limits.get(place, 2.0 * data[i].frame_s) for place in free]
-                step = np.linalg.lstsq(of_trial[:, free], of_trial[:, -1], rcond=1e-9)[0]
-                trial_effects[i, free] += np.clip(step, np.negative(most), most)
-            of_B = trial_effects[:, DAMPING_DEVIATION]
-            trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
-            columns = tuple(predictor.linearise(np.empty(0), trial_effects))
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
+    # 5: Gauss–Newton steps (chosen)
+    for _ in range(5):
+        for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
+            free = [DAMPING_DEVIATION, *others]
+            most = [limits.get(place, 2.0 * data[i].frame_s) for place in free]
+            step = np.linalg.lstsq(of_trial[:, free], of_trial[:, -1], rcond=1e-9)[0]
+            trial_effects[i, free] += np.clip(step, np.negative(most), most)
+        of_B = trial_effects[:, DAMPING_DEVIATION]
+        trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
+        columns = tuple(predictor.linearise(np.empty(0), trial_effects))
     response, variance, halves = np.empty(len(data)), np.empty(len(data)), np.empty((len(data), 2))
     for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
         sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])

@@ -36,9 +36,6 @@ from vinetrack.diagnosis.force_inversion import (
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
-from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,
@@ -416,7 +413,15 @@ class RankedLaw:
     @property
     def words(self) -> str:
         """Description of the law with its amplitude."""
-        return self.law.words(self.estimate.amplitude.tolist(), self.estimate.sigma)
+        return str(remark("law", law=self.law, amplitude_N=self.estimate.amplitude, sigma_N=self.estimate.sigma))
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """As a row of `laws` in `diagnosis.json`."""
+        amplitude, of_law = self.estimate.amplitude, {"law": self.law.name, "words": self.words}
+        size_N = float(amplitude[0]) if amplitude.size == 1 else math.hypot(*amplitude)
+        sizes = {"explained": self.explained, "amplitude_N": size_N, "sigma_N": self.estimate.sigma}
+        return of_law | sizes | {"delta_chi2": self.estimate.delta_chi2, "bic": self.bic}
 
 
 def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:
@@ -426,57 +431,37 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
     `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
     n_independent = 10.0 * len(problem.data)  # Independent residuals where a model leaves more than noise (chosen)
-    largest_N = _largest_N(point.motions)
-
-    def ranked(estimated: Sequence[tuple[Law, ForceEstimate]]) -> list[RankedLaw]:
-        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
-        laws = [
-            RankedLaw(
-                law,
-                estimate,
-                (largest - estimate.delta_chi2) / noise + law.n_parameters * math.log(n_independent),
-                largest_N=largest_N,
-            )
-            for law, estimate in estimated
-        ]
-        best: dict[str, RankedLaw] = {}
-        for each in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
-            best.setdefault(each.law.name, each)
-        return list(best.values())
-
-    estimated = _estimates(problem, point, laws_on_grid(point.motions))
-    for finer, count in ((1.0, None), (0.25, 1)):
-        best = ranked(estimated)[:count]
-        near = [law for each in best for law in laws_near(each.law, point.motions, finer)]
-        estimated += _estimates(problem, point, near)
-    return ranked(estimated)
-
-
-def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) -> list[tuple[Law, ForceEstimate]]:
-    """Each law estimated alone."""
-    if not laws:
-        return []
-    equations = ForceEquations(problem, point, lambda motion: np.hstack([law.unit_force(motion) for law in laws]))
-    ends = np.cumsum([law.n_amplitudes for law in laws]).tolist()
-    places = [slice(end - law.n_amplitudes, end) for law, end in zip(laws, ends, strict=True)]
-    return [(law, equations.estimate(place)) for law, place in zip(laws, places, strict=True)]
-
-
-def _largest_N(motions: Sequence[FittedMotion]) -> float:
-    """The largest force that is reported: ten times drive, weight and inertia of the trials at their largest."""
-    sizes = []
-    for motion in motions:
+    largest_N = 0.0
+    for motion in point.motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
-        sizes.append(float(np.max(drive_N + body_N)))
-    return 10.0 * max(sizes)
+        # 10.0: largest force that is reported, in parts of drive, weight and inertia at their largest (chosen)
+        largest_N = max(largest_N, 10.0 * float(np.max(drive_N + body_N)))
+
+    def unit_forces(motion: FittedMotion) -> Floats:
+        return np.hstack([law.unit_force(motion) for law in laws])
+
+    laws, estimated, best = laws_on_grid(point.motions), list[tuple[Law, ForceEstimate]](), dict[str, RankedLaw]()
+    for near, part in ((None, 1.0), (1, 0.25), (0, 0.0)):
+        equations, end = ForceEquations(problem, point, unit_forces), 0
+        for law in laws:
+            begin, end = end, end + law.n_amplitudes
+            estimated.append((law, equations.estimate(slice(begin, end))))
+        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
+        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
+        ranked = []
+        for law, estimate in estimated:
+            bic = (largest - estimate.delta_chi2) / noise + law.n_parameters * math.log(n_independent)
+            ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
+        best = {}
+        for each in sorted(ranked, key=lambda law: (not law.is_detected, law.bic)):
+            best.setdefault(each.law.name, each)
+        laws = [law for each in list(best.values())[:near] for law in laws_near(each.law, point.motions, part)]
+    return list(best.values())
 
 
 # ------------------------------------------------------------------------------
 # What is missing.
-
-LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
@@ -505,18 +490,12 @@ class MissingForce:
         }
 
 
-def force_problem(fit: Fit) -> ForceProblem:
-    """What is asked of forces beside a fit, with the scatter of its replicates."""
-    try:
-        return ForceProblem(fit, replicate_scatter(fit, residual_courses(fit)[0]))
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
-
-
 @in_one_blas_thread
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
-    problem = force_problem(fit)
+    import pandas as pd
+
+    problem = ForceProblem(fit)
     first = choices = choices_seen_from(problem, problem.start)
     learned = None
     with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
@@ -536,23 +515,12 @@ def missing_force(fit: Fit) -> MissingForce:
     drawn = learned or max(choices, key=lambda choice: choice.found.log_evidence)
     return MissingForce(
         table=drawn.table,
-        laws=_law_table(laws),
+        laws=pd.DataFrame([law.row for law in laws]),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
         detected=tuple(law for law in laws if law.is_detected),
         learned=learned,
     )
-
-
-def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
-    import pandas as pd
-
-    rows = []
-    for law in laws:
-        amplitude, estimate = law.estimate.amplitude, law.estimate
-        size_N = float(amplitude[0]) if amplitude.size == 1 else float(np.hypot(*amplitude))
-        rows.append((law.law.name, law.words, law.explained, size_N, estimate.sigma, estimate.delta_chi2, law.bic))
-    return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
 
 def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> Remark:

@@ -40,7 +40,6 @@ from vinetrack.diagnosis.missing_force import (
     LOG_RATIO,
     LOGARITHMIC,
     VARIABLES,
-    Axis,
     Domain,
     LearnedForce,
     RankedLaw,
@@ -130,7 +129,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
         constants=f"TABLE = np.array({numbers})  # N\n\n",
         parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
         arguments={"a": 1.0},
-        body=[*(line for k, axis in enumerate(domain.axes) for line in _axis_code(axis, k)), *_sum_code(domain)],
+        body=_table_code(domain),
         worked_N=worked_N,
         how="the learned force at this state",
         state={_STATE[name]: value for name, value in at.items()},
@@ -183,37 +182,30 @@ def _parameter(names: Sequence[str], value: str, bounds: Sequence[float], plausi
     return "Parameter({}, {}, bounds={}, plausible={}, {}),".format(quoted, value, *limits, more)
 
 
-def _sum_code(domain: Domain) -> list[str]:
-    """Lines of code that sum the nonzero splines along one axis, or along two."""
-    if len(domain.variables) == 1:
-        return ["return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])"]
-    rows = [
-        f"r{k} = " + " + ".join(f"g{m} * TABLE[i + {k}, j + {m}]" for m in range(4)).replace(" + 0", "")
-        for k in range(4)
-    ]
-    return [*rows, "return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
-
-
-def _axis_code(axis: Axis, k: int) -> list[str]:
-    """Lines of code that find the interval of the table in which a state lies, and the four nonzero splines there."""
-    at, step, weight, steps = "uv"[k], "ij"[k], "fg"[k], axis.count - 3
-    state = f"s.{_STATE[axis.name]}"
-    from_low = f"({state} - {_code_number(axis.low)})" if axis.low else state
-    position = f"np.minimum(np.maximum({from_low} / {_code_number(axis.high - axis.low)}, 0.0), 1.0)"
-    if axis.name in LOGARITHMIC:
-        position = f"np.log1p({LOG_RATIO} * {position}) / {_code_number(math.log1p(LOG_RATIO))}"
-    return [
-        f"{at} = {steps}.0 * {position}",
-        f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",
-        f"{at} = {at} - {step}",
-        f"{weight}0, {weight}3 = (1.0 - {at}) ** 3 / 6.0, {at}**3 / 6.0",
-        f"{weight}1 = (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0",
-        f"{weight}2 = 1.0 - {weight}0 - {weight}1 - {weight}3",
-    ]
-
-
-def _code_number(value: float) -> str:
-    return repr(float(f"{value:.12g}"))
+def _table_code(domain: Domain) -> list[str]:
+    """Lines of code that find the interval of the table in which a state lies, and sum the splines that are nonzero."""
+    lines, loops, splines, places = [], [], "", []
+    for depth, (axis, at, place, k) in enumerate(zip(domain.axes, "uv", "ij", "km", strict=False)):
+        low, width = (repr(float(f"{value:.12g}")) for value in (axis.low, axis.high - axis.low))
+        part = f"np.minimum(np.maximum((s.{_STATE[axis.name]} - {low}) / {width}, 0.0), 1.0)"
+        if axis.name in LOGARITHMIC:
+            part = f"np.log1p({LOG_RATIO} * {part}) / np.log1p({LOG_RATIO})"
+        lines += [
+            f"{at} = {axis.count - 3}.0 * {part}",
+            f"{place} = np.maximum(np.minimum(np.int64({at}), {axis.count - 4}), 0)",
+            f"{at} = {at} - {place}",
+            f"of_{at} = (",
+            f"    (1.0 - {at}) ** 3 / 6.0,",
+            f"    (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0,",
+            f"    (1.0 + 3.0 * {at} + 3.0 * {at}**2 - 3.0 * {at}**3) / 6.0,",
+            f"    {at}**3 / 6.0,",
+            ")",
+        ]
+        loops.append(f"{'    ' * depth}for {k} in range(4):")
+        splines += f"of_{at}[{k}] * "
+        places.append(f"{place} + {k}")
+    step = f"{'    ' * len(loops)}total = total + {splines}TABLE[{', '.join(places)}]"
+    return [*lines, "total = 0.0", *loops, step, "return a * total"]
 
 
 # ------------------------------------------------------------------------------
@@ -234,6 +226,11 @@ class Proposed:
     effect: Effect
     ratio: LikelihoodRatio
     rms_left_out_m: float = math.nan
+
+    @property
+    def log_likelihood(self) -> float:
+        """Ln L of its fit."""
+        return self.ratio.fit.log_likelihood
 
 
 @dataclass(frozen=True)
@@ -266,10 +263,10 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         before, laws = _fitted(before, best, Path(folder), report)
         report("errors on left-out conditions")
         error_m = left_out(before).rms_m
-        laws.sort(key=lambda law: -law.ratio.fit.log_likelihood)
+        laws.sort(key=lambda law: -law.log_likelihood)
         laws = [
             replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
-            if 2 * (laws[0].ratio.fit.log_likelihood - law.ratio.fit.log_likelihood) < OUT_OF_REACH
+            if 2 * (laws[0].log_likelihood - law.log_likelihood) < OUT_OF_REACH
             else law
             for law in laws
         ]
@@ -277,8 +274,20 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         not_excluded = answer_set([law.ratio for law in significant])[0] if significant else []
         tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
         reason = Remark() if tied else remark("no_law_predicts_better" if best else "no_law_detected")
-        table = _table(before, [law.ratio.fit for law in tied], force.learned, Path(folder), report)
-    return Proposal(before, error_m, tuple(laws), tied, reason, table)
+        # The learned force as a table, where it explains what no law does
+        misfit, fits = before.chi2_per_dof - 1, [law.ratio.fit for law in tied]
+        remaining = min((fit.chi2_per_dof for fit in fits), default=before.chi2_per_dof) - 1
+        # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
+        is_open = misfit >= LEAST_CHI2_PER_POINT - 1 and remaining >= (1 - 0.9) * misfit
+        tried = [force.learned] if force.learned is not None and is_open else []
+        start, tables = _fitted(before, tried, Path(folder), report)
+        tables = [
+            replace(table, rms_left_out_m=left_out(table.ratio.fit).rms_m)
+            for table in tables
+            if _explains(start, table.ratio)
+            and all(2 * (table.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in fits)
+        ]
+    return Proposal(before, error_m, tuple(laws), tied, reason, next(iter(tables), None))
 
 
 def _fitted(
@@ -320,25 +329,6 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
     return ratio.sigma > LEAST_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
 
 
-def _table(
-    before: Fit, laws: Sequence[Fit], learned: LearnedForce | None, folder: Path, report: Callable[[str], None]
-) -> Proposed | None:
-    """The missing force as a smooth function, fitted as a table, where it explains what no law does."""
-    misfit = before.chi2_per_dof - 1
-    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
-    # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
-    if learned is None or misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
-        return None
-    start, tables = _fitted(before, [learned], folder, report)
-    for table in tables:
-        fit = table.ratio.fit
-        better = all(2 * (fit.log_likelihood - law.log_likelihood) > ANSWER_SET_DELTA_CHI2 for law in laws)
-        if better and _explains(start, table.ratio):
-            report("errors with the table")
-            return replace(table, rms_left_out_m=left_out(fit).rms_m)
-    return None
-
-
 # ------------------------------------------------------------------------------
 # A law as an effect file.
 
@@ -356,53 +346,36 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
         by = FORMS[law.factor]
         times, symbol = f" * {by.code}", f" {by.formula.split()[-1]}"
         unit += by.size[2].removeprefix("N")
-    size, *shapes = (float(f"{value:.6g}") for value in _values(detected))
-    limit = 100 * abs(size)
-    of_size = (*form.size[:2], unit)
-    parameters = [
-        _parameter(of_size, repr(size), (-limit, limit), (0.0, 10 * size), 'meaning="size of the law"'),
-        *(_shape_parameter(shape[:3], value) for shape, value in zip(form.shapes, shapes, strict=True)),
-    ]
+    amplitude, shapes = detected.estimate.amplitude, law.shapes
+    if law.kind == "periodic":
+        amplitude, shapes = np.array([math.hypot(*amplitude)]), (shapes[0], math.atan2(amplitude[1], amplitude[0]))
+    size, *values = (float(f"{value:.6g}") for value in (amplitude[0] / law.peak, *shapes))
     names = [form.size[0], *(shape.name for shape in form.shapes)]
+    bounds, plausible = (-100 * abs(size), 100 * abs(size)), (0.0, 10 * size)
+    parameters = [_parameter((*form.size[:2], unit), repr(size), bounds, plausible, 'meaning="size of the law"')]
+    for shape, value in zip(form.shapes, values, strict=True):
+        bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
+        if shape.name in ("phi", "y_1"):
+            half = math.pi if shape.name == "phi" else max(abs(value), 0.01)
+            bounds, plausible = (value - 2 * half, value + 2 * half), (value - half, value + half)
+        more = f'tried=({value!r},), meaning="its shape"'
+        parameters.append(_parameter(shape[:3], f"{value!r}, zero={value!r}", bounds, plausible, more))
     formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), ""
     if law.reference_area_m2:
         times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
         state["area"] = law.reference_area_m2
         constants = f"AREA = {law.reference_area_m2:.6g}  # m²\n\n"
-    worked_N = _force_N(detected)
+    # From the law itself: it checks the formula of the file
+    along = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
+    there = SimpleNamespace(**along, trial=SimpleNamespace(area_m2=law.reference_area_m2))
+    worked_N = float((law.unit_force(there) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
     return _source(
         str(remark("law_file", law=detected.words, formula=formula, origin=origin)),
         constants=constants,
         parameters=parameters,
-        arguments=dict(zip(names, (size, *shapes), strict=True)),
+        arguments=dict(zip(names, (size, *values), strict=True)),
         body=[f"return {names[0]} * ({form.code}){times}"],
         worked_N=worked_N,
         how=f"the fitted law at this state: {size:.6g} × {worked_N / size:.6g}",
         state=state,
-    )
-
-
-def _values(detected: RankedLaw) -> tuple[float, ...]:
-    """Size and shape parameters of a law as its effect holds them, SI."""
-    law, amplitude = detected.law, detected.estimate.amplitude
-    if law.kind == "periodic":
-        return math.hypot(*amplitude), law.shapes[0], math.atan2(amplitude[1], amplitude[0])
-    return amplitude[0] / law.peak, *law.shapes
-
-
-def _force_N(detected: RankedLaw) -> float:
-    """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
-    state = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
-    motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
-    return float((detected.law.unit_force(motion) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
-
-
-def _shape_parameter(names: tuple[str, str, str], value: float) -> str:
-    if names[0] in ("phi", "y_1"):
-        half_range = math.pi if names[0] == "phi" else max(abs(value), 0.01)
-        bounds, plausible = (value - 2 * half_range, value + 2 * half_range), (value - half_range, value + half_range)
-    else:
-        bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
-    return _parameter(
-        names, f"{value!r}, zero={value!r}", bounds, plausible, f'tried=({value!r},), meaning="its shape"'
     )
