@@ -358,27 +358,18 @@ class ForceProblem:
     ) -> ForcePoint:
         """The terms of the model, and of a force beside it, along motions."""
         step = 1e-3  # Step of finite differences, in the fit's scaling of parameters (derived)
-        predictor = self.fit.predictor
-        here, *by_effect = (
-            predictor.jobs(theta, trial_effects + step * unit)
-            for unit in np.eye(N_TRIAL_EFFECTS + 1)[[-1, PRESSURE, DAMPING_DEVIATION], :N_TRIAL_EFFECTS]
-        )
-        by_parameter = [predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)]
+        predictor, effects = self.fit.predictor, np.eye(N_TRIAL_EFFECTS)[[PRESSURE, DAMPING_DEVIATION]]
+        here = predictor.jobs(theta, trial_effects)
+        by_effect = [predictor.jobs(theta, trial_effects + step * unit) for unit in effects]
+        # The last stands for a parameter that a trial does not have, whose place is −1.
+        by_parameter = [*(predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)), here]
         moved, derivatives = [], []
-        for i, motion in enumerate(motions):
-            motion = with_terms(self._with_job(motion, here[i]), push)
-            affected = (predictor.has_pressure_deviation[i], predictor.has_damping_deviation[i])
-            jobs = [each[i] if acts else None for each, acts in zip(by_effect, affected, strict=True)]
-            jobs += [by_parameter[k][i] if k >= 0 else None for k in predictor.layout.index[i]]
-            _, before = _accelerated(motion, push)
-            columns = [
-                np.zeros_like(before)
-                if job is None
-                else (_accelerated(self._with_job(motion, job), push)[1] - before) / step
-                for job in jobs
-            ]
-            moved.append(motion)
-            derivatives.append(np.column_stack(columns))
+        for i, (motion, index) in enumerate(zip(motions, predictor.layout.index, strict=True)):
+            moved.append(with_terms(self._with_job(motion, here[i]), push))
+            before = _accelerated(moved[i], push)[1]
+            jobs = [jobs[i] for jobs in (*by_effect, *(by_parameter[k] for k in index))]
+            after = [_accelerated(self._with_job(motion, job), push)[1] for job in jobs]
+            derivatives.append((np.column_stack(after) - before[:, None]) / step)
         return ForcePoint(theta, trial_effects, moved, derivatives)
 
     def _with_job(self, motion: FittedMotion, job: Jobs) -> FittedMotion:

@@ -113,7 +113,7 @@ def locate(fit: Fit) -> Failure:
     )
 
 
-def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter) -> dict[str, object]:
+def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter) -> Row:
     """Errors of a condition, and by a normal deviate whether between-trial scatter explains stretch means as large. The
     test statistic is the mean square of the deviates, with the effective degrees of freedom of Satterthwaite's
     approximation, because stretches are correlated.
@@ -235,19 +235,18 @@ def drift(fit: Fit) -> Drift:
     """Test B for drift with pressure, payload, angle, chamber, inlet or along the growth, and P_y against the sheet."""
     import pandas as pd
 
-    tests: list[ConstancyTest] = []
+    tests = list(against_the_sheet(fit))
     if DAMPING in fit.predictor.layout.keys:
         estimates = per_trial_estimates(fit, align_trials(fit))
-        tests += [test for against in COVARIATES for test in _against(estimates, against)]
-        tests += _along_growth(estimates)
-    tests = sorted([*tests, *against_the_sheet(fit)], key=lambda tested: tested.p)
+        of_B = [test for against in COVARIATES for test in _against(estimates, against)]
+        tests = [*of_B, *_along_growth(estimates), *tests]
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
-    rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
-    groups = [group for test in tests for group in test.groups]
-    return Drift(
-        pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool}),
-        pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
+    table = pd.DataFrame(tests, columns=[*DRIFT_COLUMNS, "p", "groups"]).sort_values(
+        "p", kind="stable", ignore_index=True
     )
+    groups = [group for of_test in table["groups"] for group in of_test]
+    table["significant"] = table["p"] < level
+    return Drift(table[list(DRIFT_COLUMNS)], pd.DataFrame(groups, columns=list(GROUP_COLUMNS)))
 
 
 def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
@@ -263,49 +262,38 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
-@dataclass(frozen=True)
-class ConstancyTest:
-    """A row of the table of drifts with its p-value, and the rows of its groups."""
-
-    row: dict[str, object]
-    p: float
-    groups: Sequence[dict[str, object]]
+Row = dict[str, object]
 
 
-def _subject(number: Number, vine: str, against: str) -> dict[str, object]:
+def _subject(number: Number, vine: str, against: str) -> Row:
     """What rows of both tables are about: the parameter, its vine, and the condition."""
     return {"parameter": number.key, "vine": vine, "symbol": number.symbol, "unit": number.unit, "against": against}
 
 
 def _tested(
-    subject: dict[str, object],
+    subject: Row,
     levels: tuple[float, float],
     change: tuple[float, float],
     p: tuple[float, ...],
     dof: float,
     n_trials: int,
-    groups: Sequence[dict[str, object]] = (),
+    groups: Sequence[Row] = (),
     **told: Any,
-) -> ConstancyTest:
-    """A test as a row of the table: levels from and to, the change between them and its standard error. `p` are the
-    p-values of a steady change and, where it is asked, of any; `told` is what the sentence about it needs besides.
+) -> Row:
+    """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
+    its standard error. `p` are the p-values of a steady change and, where it is asked, of any; `told` is what the
+    sentence about it needs besides.
     """
-    numbers = (*levels, *change, _normal_deviate(p[0]), _normal_deviate(p[-1]), dof, n_trials)
-    row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
-    sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
-    return ConstancyTest({**row, "sentence": sentence}, min(1.0, len(p) * min(p)), groups)
-
-
-def _normal_deviate(p: float) -> float:
-    """The normal deviate with this two-sided p-value."""
     from scipy.stats import norm
 
-    return float(norm.isf(max(p, 1e-300) / 2))
+    z, z_constancy = (float(norm.isf(max(each, 1e-300) / 2)) for each in (p[0], p[-1]))
+    numbers = (*levels, *change, z, z_constancy, dof, n_trials)
+    row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
+    sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
+    return row | {"sentence": sentence, "p": min(1.0, len(p) * min(p)), "groups": groups}
 
 
-def _group(
-    subject: dict[str, object], level: float, base: float, deviation: float, sigma: float, n_trials: int
-) -> dict[str, object]:
+def _group(subject: Row, level: float, base: float, deviation: float, sigma: float, n_trials: int) -> Row:
     """A row of the table of groups: B and its ratio to the common value `base`, each with its standard error, from the
     deviation of ln B and its standard error.
     """
@@ -406,7 +394,7 @@ def _in_halves(growth_m: Floats, columns: Floats, nuisances: list[int]) -> Float
 # Tests of whether B of single trials varies with a condition: linear trend and differences.
 
 
-def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTest]:
+def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
     """Tests against one condition, of each vine alone and of all: of a linear trend, and by Fisher's F test whether all
     levels have the same mean, both about the mean of each vine.
     """
@@ -485,7 +473,7 @@ def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_])
     return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
 
 
-def _along_growth(estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
+def _along_growth(estimates: PerTrialEstimates) -> Iterator[Row]:
     """Test ln B for a change along the growth, for every vine and for all: the mean difference of the halves, each
     fitted by itself. The scatter of pressure and B between trials is the same in both halves and cancels. An effect
     that builds up along the growth shows here even where n and the yield pressure absorb it in every comparison between
@@ -512,7 +500,7 @@ def _along_growth(estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
         yield _tested(subject, ends, _relative(mean, sigma), (p,), dof, rise.size, shown)
 
 
-def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
+def against_the_sheet(fit: Fit) -> Iterator[Row]:
     """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
     fit adds to σ² for scatter and shared errors comes on top.

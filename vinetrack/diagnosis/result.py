@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import plot
-from vinetrack.diagnosis.power import Power
+from vinetrack.diagnosis.power import Power, StoredRemark
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
 if TYPE_CHECKING:
@@ -128,9 +128,7 @@ class Candidate(JsonRecord):
     numbers: tuple[Number, ...] = ()
     plausible: bool = True
     in_answer_set: bool = False
-    reason: Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)] = field(
-        default_factory=Remark
-    )
+    reason: Annotated[StoredRemark, Field(alias="reason_code")] = field(default_factory=Remark)
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: OrNaN = math.nan
@@ -143,16 +141,10 @@ class Candidate(JsonRecord):
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
-        entry = super().to_json()
-        return {**entry, "reason": str(self.reason), "reason_code": entry["reason"]}
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
-        """Read an entry of `ranking`; absent keys take their defaults."""
-        return super().from_json({**entry, "reason": entry.get("reason_code")})
+        return {**super().to_json(), "reason": str(self.reason)}
 
 
-StoredCandidate = Annotated[Candidate, BeforeValidator(Candidate.from_json), PlainSerializer(Candidate.to_json)]
+StoredCandidate = Annotated[Candidate, PlainSerializer(Candidate.to_json)]
 
 
 @dataclass(frozen=True, kw_only=True)
