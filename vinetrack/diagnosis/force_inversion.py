@@ -473,9 +473,10 @@ class ForceEquations:
         change = coefficients - self.coefficients
         return self.chi2 - 2 * float(self.score @ change) + float(change @ self.information @ change)
 
-    def moved(self, coefficients: Floats) -> tuple[Floats, Floats, list[FittedMotion]]:
-        """Parameters, trial effects and motions with other coefficients, to first order; releases move by at most two
-        frames, and parameters stay inside their bounds.
+    def moved(self, coefficients: Floats) -> ForcePoint:
+        """The point with other coefficients, to first order: a Gauss–Newton step of all unknowns and motions together
+        (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010). Releases move by at most two frames, and
+        parameters stay inside their bounds.
         """
         point, prior = self.point, self.problem.prior
         change = coefficients - self.coefficients
@@ -489,29 +490,8 @@ class ForceEquations:
         pushes = [columns @ sizes for columns, sizes in zip(self.accelerations, by_all, strict=True)]
         dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
         motions = [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
-        return theta, point.trial_effects + effects, motions
-
-
-def settled(equations: ForceEquations, estimate: Callable[[ForceEquations], Floats]) -> tuple[float, ForcePoint]:
-    """χ² and motions under a force to which they respond in full: Gauss–Newton steps of all unknowns and motions
-    together (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010), with new estimates of the coefficients.
-    """
-    problem, unit_push, best = equations.problem, equations.unit_push, (math.inf, equations.point)
-    try:
-        with np.errstate(all="raise", under="ignore"):
-            # 8: most steps (chosen)
-            for _ in range(8):
-                coefficients = estimate(equations)
-                push = partial(lambda of_all, motion: unit_push(motion) @ of_all, coefficients)
-                point = problem.point(*equations.moved(coefficients), push)
-                equations = ForceEquations(problem, point, unit_push, coefficients)
-                # 1e-3: relative fall of χ² below which the search ends (chosen)
-                if not equations.cost < (1 - 1e-3) * best[0]:
-                    break
-                best = equations.cost, point
-    except (FloatingPointError, np.linalg.LinAlgError):
-        pass  # The step led where nothing can be computed: the point before it stands.
-    return best
+        force = partial(lambda of_all, motion: self.unit_push(motion) @ of_all, coefficients)
+        return self.problem.point(theta, point.trial_effects + effects, motions, force)
 
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:

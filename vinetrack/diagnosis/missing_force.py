@@ -32,7 +32,6 @@ from vinetrack.diagnosis.force_inversion import (
     ForceEstimate,
     ForcePoint,
     ForceProblem,
-    settled,
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
@@ -353,16 +352,9 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
     # Besides the best, those with enough weight, and those of no more variables whose χ² is hardly larger, without
     # regard to how smooth they are. 0.05: weight from which a choice is reported with the best (chosen)
     threshold = best.least_chi2 + inflation * unit * ANSWER_SET_DELTA_CHI2
-    others = [
-        other.domain.name
-        for other in choices
-        if other is not best
-        and (
-            weights[other.domain.name] >= 0.05
-            or (len(other.domain.variables) <= len(domain.variables) and other.least_chi2 < threshold)
-        )
-    ]
-    others.sort(key=lambda name: -weights[name])
+    as_good = {choice.domain.name for choice in choices if choice.least_chi2 < threshold}
+    as_good -= {name for name in as_good if "+" in name and len(domain.axes) == 1}
+    others = [name for name in weights if name != domain.name and (weights[name] >= 0.05 or name in as_good)]
     return LearnedForce(
         domain=domain,
         found=best.found,
@@ -377,16 +369,25 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
 
 def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
     """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
-    less: far from the solution, two are often the more likely for errors of the linear equations alone.
+    less: far from the solution, two are often the more likely for errors of the linear equations alone. Motions respond
+    in full, by steps with new estimates of the coefficients.
     """
-    inflation = problem.inflation(_least_chi2(choices))
+    inflation, found = problem.inflation(_least_chi2(choices)), [(math.inf, choices[0].equations.point)]
     by_evidence = sorted(choices, key=lambda choice: -choice.found.log_evidence)
-    likely = {len(choice.domain.variables): choice for choice in reversed(by_evidence)}
-
-    def settle(choice: Choice) -> tuple[float, ForcePoint]:
-        return settled(choice.equations, lambda each: coefficients_of(choice.domain, each, inflation).mean)
-
-    return min((settle(choice) for choice in likely.values()), key=lambda found: found[0])[1]
+    for choice in {len(choice.domain.axes): choice for choice in reversed(by_evidence)}.values():
+        equations, cost = choice.equations, math.inf
+        # A step may lead where nothing can be computed: the point before it stands.
+        with suppress(FloatingPointError, np.linalg.LinAlgError):
+            # 8, 1e-3: most steps, and relative fall of χ² below which the search ends (chosen)
+            for _ in range(8):
+                coefficients = coefficients_of(choice.domain, equations, inflation).mean
+                point = equations.moved(coefficients)
+                equations = ForceEquations(problem, point, choice.domain.unit_push, coefficients)
+                if not equations.cost < (1 - 1e-3) * cost:
+                    break
+                cost = equations.cost
+                found.append((cost, point))
+    return min(found, key=lambda each: each[0])[1]
 
 
 # ------------------------------------------------------------------------------
