@@ -50,11 +50,6 @@ class Law:
         return sum(len(shape.parts) > 1 for shape in FORMS[self.kind].shapes)
 
     @property
-    def n_parameters(self) -> int:
-        """Number of parameters; a factor counts as one, because it was chosen among several."""
-        return self.n_amplitudes + self.n_shapes + bool(self.factor)
-
-    @property
     def is_unresolved(self) -> bool:
         """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
         # 1e-3: least width of a local force that is reported (chosen)
@@ -125,9 +120,7 @@ FORMS = {
     "speed_squared": LawForm(
         ("c", "c", "N·s²/m²"), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure")
     ),
-    "position_squared": LawForm(
-        ("q", "q", "N/m²"), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH
-    ),
+    "position_squared": LawForm(("q", "q", "N/m²"), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH),
     "beyond_a_place": LawForm(
         ("k", "k", "N/m"), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)", "growth",
         (Shape("y_0", "y₀", "m", _SETS_IN),), _BY_BOTH,

@@ -351,7 +351,7 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         of_B = trial_effects[:, DAMPING_DEVIATION]
         trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
         columns = tuple(predictor.linearise(np.empty(0), trial_effects))
-    response, variance, halves = np.empty(len(data)), np.empty(len(data)), np.empty((len(data), 2))
+    response, variance, halves = np.empty(len(data)), np.empty(len(data)), np.full((len(data), 2), math.nan)
     for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
         sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])
         response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
@@ -360,8 +360,17 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
         scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
         variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
-        growth = data[i].lead_position_m - of_trial[:, -1] - trial_effects[i, ORIGIN]
-        halves[i] = trial_effects[i, DAMPING_DEVIATION] + _in_halves(growth, of_trial, others)
+        # ln B in each half of the growth, linearised about the trial's own: about the common one, the between-trial
+        # scatter would enter in second order. What B does in the first half is carried through the second as a shift
+        # in time, as where inertia is small.
+        growth_m = data[i].lead_position_m - of_trial[:, -1] - trial_effects[i, ORIGIN]
+        first, speed = of_trial[:, DAMPING_DEVIATION].copy(), -of_trial[:, RELEASE]
+        middle = int(np.argmax(growth_m >= 0.5 * growth_m.max()))
+        if speed[middle] > 0 and first[middle] != 0:
+            first[middle:] = first[middle] * speed[middle:] / speed[middle]
+            design = np.column_stack([first, of_trial[:, DAMPING_DEVIATION] - first, of_trial[:, others]])
+            change = np.linalg.lstsq(design, of_trial[:, -1], rcond=1e-9)[0][:2]
+            halves[i] = trial_effects[i, DAMPING_DEVIATION] + change
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
     known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
     return PerTrialEstimates(
@@ -372,22 +381,6 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         variance=variance,
         halves=halves,
     )
-
-
-def _in_halves(growth_m: Floats, columns: Floats, nuisances: list[int]) -> Floats:
-    """Best-fit change of ln B of one trial in each half of its growth, shape (2,), linearised about its own B: about
-    the common B, the between-trial scatter would enter in second order. What B does in the first half is carried
-    through the second as a shift in time, as where inertia is small. Shapes: growth_m (n_points,), columns (n_points,
-    n).
-    """
-    response, speed = columns[:, DAMPING_DEVIATION], -columns[:, RELEASE]
-    middle = int(np.argmax(growth_m >= 0.5 * growth_m.max()))
-    if not speed[middle] > 0 or response[middle] == 0:
-        return np.full(2, math.nan)
-    first = response.copy()
-    first[middle:] = response[middle] * speed[middle:] / speed[middle]
-    design = np.column_stack([first, response - first, columns[:, nuisances]])
-    return np.asarray(np.linalg.lstsq(design, columns[:, -1], rcond=1e-9)[0][:2])
 
 
 # ------------------------------------------------------------------------------

@@ -452,7 +452,9 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
         noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
         ranked = []
         for law, estimate in estimated:
-            bic = (largest - estimate.delta_chi2) / noise + law.n_parameters * math.log(n_independent)
+            # A factor counts as a parameter, because it was chosen among several.
+            n_parameters = law.n_amplitudes + law.n_shapes + bool(law.factor)
+            bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(n_independent)
             ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
         best = {}
         for each in sorted(ranked, key=lambda law: (not law.is_detected, law.bic)):

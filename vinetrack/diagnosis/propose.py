@@ -25,7 +25,7 @@ from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS, STATE
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -46,7 +46,7 @@ from vinetrack.diagnosis.missing_force import (
     missing_force,
 )
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
-from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
+from vinetrack.effects import Effect, EffectError, find_effect, load_effect, own_effects, remember
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
@@ -67,9 +67,6 @@ def add(
     """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
     (the ladder of errors, one row for each model).
     """
-    from vinetrack.diagnosis.ladder import ladder
-    from vinetrack.effects import own_effects
-
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(experiment.settings.model, user_effects)
     if name.endswith(".py"):
