@@ -1,4 +1,8 @@
-"""Simple laws that a missing force may follow, each with its description in words.
+"""Simple laws that a missing force may follow, each a row of `force_laws.csv` beside this file.
+
+A row holds the size (name, symbol and unit), the law as code of an effect file and as a formula, the kinds that it is
+also tried multiplied by, and its shape parameters (name, symbol, unit), each with the values that are tried, as parts
+of the `largest` growth, speed or time. All of these are chosen. Values beyond 0 are spaced by ratios.
 
 Every law is scaled to a peak of 1 along the fitted motions, so that its amplitude is the largest force, N. A periodic
 law has two amplitudes, of a sine and a cosine. Laws with a position or a scale come in a grid of them.
@@ -6,11 +10,12 @@ law has two amplitudes, of a sine and a cosine. Laws with a position or a scale 
 
 from __future__ import annotations
 
+import csv
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from pathlib import Path
 from types import CodeType, SimpleNamespace
 from typing import NamedTuple
 
@@ -18,8 +23,6 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import FittedMotion
-
-EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
 
 
 @dataclass(frozen=True)
@@ -73,9 +76,7 @@ STATE = {
 
 
 class Shape(NamedTuple):
-    """A shape parameter of a law as an effect file holds it, and the values that are tried, as parts of the largest
-    growth, speed or time; values beyond 0 are spaced by ratios.
-    """
+    """A shape parameter of a law, and the values that are tried."""
 
     name: str
     symbol: str
@@ -85,87 +86,40 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class LawForm:
-    """A kind of law as an effect file holds it: its size (name, symbol, unit), its
-    shape as code and as a formula, and its shape parameters, of the dimension of `largest`. `times` is what it is also
-    tried multiplied by.
-    """
+    """A kind of law: a row of `force_laws.csv`."""
 
     size: tuple[str, str, str]
     code: str
+    compiled: CodeType
     formula: str
-    largest: str = ""
-    shapes: tuple[Shape, ...] = ()
-    times: tuple[str, ...] = ()
-
-    @cached_property
-    def _compiled(self) -> CodeType:
-        return compile(self.code, "law", "eval")
+    times: tuple[str, ...]
+    largest: str
+    shapes: tuple[Shape, ...]
 
     def along(self, motion: FittedMotion, shapes: Sequence[float] = ()) -> Floats:
         """The shape along a motion, as its code says, shape (n_times,)."""
         state = SimpleNamespace(**{name: getattr(motion, attribute) for name, attribute in STATE.items()})
         known = dict(zip((shape.name for shape in self.shapes), shapes, strict=True))
-        return np.asarray(eval(self._compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
+        return np.asarray(eval(self.compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
 
 
-_FORCE = ("F", "F", "N")
-_BY_BOTH, _BY_PRESSURE = ("speed", "pressure"), ("pressure",)
-_SETS_IN, _DECAYS = tuple(((np.arange(8) + 0.5) / 8).tolist()), (0.04, 0.1, 0.2, 0.4)
-_V_1 = (Shape("v_1", "v₁", "m/s", _SETS_IN),)
-# All parts that are tried are chosen; below 0.05 of the highest speed 1/ẋ is held constant, as a vine starts from rest.
-FORMS = {
-    "constant": LawForm(_FORCE, "1.0", "F"),
-    "position": LawForm(("k", "k", "N/m"), "s.tail_position", "k x", times=_BY_BOTH),
-    "speed": LawForm(("b", "b", "N·s/m"), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE),
-    "speed_squared": LawForm(
-        ("c", "c", "N·s²/m²"), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure")
-    ),
-    "position_squared": LawForm(("q", "q", "N/m²"), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH),
-    "beyond_a_place": LawForm(
-        ("k", "k", "N/m"), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)", "growth",
-        (Shape("y_0", "y₀", "m", _SETS_IN),), _BY_BOTH,
-    ),
-    "speed_cubed": LawForm(("c", "c", "N·s³/m³"), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³"),
-    "beyond_a_speed": LawForm(
-        ("b", "b", "N·s/m"), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", "speed", _V_1
-    ),
-    "squared_beyond_a_speed": LawForm(
-        ("c", "c", "N·s²/m²"), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", "speed", _V_1
-    ),
-    "pressure": LawForm(("a", "a", "N/Pa"), "s.pressure", "a P"),
-    "time": LawForm(("r", "r", "N/s"), "s.time", "r t"),
-    "inverse_speed": LawForm(
-        _FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", "speed",
-        (Shape("v_0", "v₀", "m/s", (0.05,)),), _BY_PRESSURE,
-    ),
-    "falling_with_speed": LawForm(
-        _FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", "speed",
-        (Shape("v_0", "v₀", "m/s", _DECAYS),), _BY_PRESSURE,
-    ),
-    "fading_in_time": LawForm(
-        _FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", "time", (Shape("t_0", "t₀", "s", _DECAYS),)
-    ),
-    "fading_along": LawForm(
-        _FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", "growth",
-        (Shape("reach", "ℓ", "m", _DECAYS),), _BY_BOTH,
-    ),
-    "patch": LawForm(
-        _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
-        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
-        f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
-        "growth",
-        (
-            Shape("y_1", "y₁", "m", tuple(((np.arange(17) - 1) / 16).tolist())),
-            Shape("width", "w", "m", (0.06, 0.12, 0.2, 0.33)),
-        ),
-        _BY_BOTH,
-    ),
-    "periodic": LawForm(
-        _FORCE, "np.sin(2.0 * np.pi * s.lead_position / period + phi)", "F sin(2π y/Λ + φ)", "growth",
-        (Shape("period", "Λ", "m", tuple(np.geomspace(0.04, 0.6, 24).tolist())), Shape("phi", "φ", "rad", (0.0,))),
-    ),
-}  # fmt: skip
+def _read_forms() -> dict[str, LawForm]:
+    forms = {}
+    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            described = [each.split(":") for each in row["shapes"].split(";") if each]
+            shapes = tuple(
+                Shape(name, symbol, unit, tuple(map(float, parts.split())))
+                for names, parts in described
+                for name, symbol, unit in [names.split()]
+            )
+            size, code = (row["size"], row["symbol"], row["unit"]), compile(row["code"], row["kind"], "eval")
+            times = tuple(row["times"].split())
+            forms[row["kind"]] = LawForm(size, row["code"], code, row["formula"], times, row["largest"], shapes)
+    return forms
+
+
+FORMS = _read_forms()  # Every kind of law by its name
 
 
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
@@ -189,15 +143,14 @@ def laws_near(law: Law, motions: Sequence[FittedMotion], part: float) -> list[La
     """Laws near another: each shape that is searched over varied by less than this part of a step of the grid."""
     form, varied = FORMS[law.kind], []
     for value, shape in zip(law.shapes, form.shapes, strict=True):
-        first, last, steps = shape.parts[0], shape.parts[-1], max(len(shape.parts) - 1, 1)
-        change = part * np.linspace(-0.75, 0.75, 9 if len(shape.parts) > 1 else 1) / steps
+        first, last, steps = shape.parts[0], shape.parts[-1], len(shape.parts) - 1
+        change = part * np.linspace(-0.75, 0.75, 9) / steps if steps else np.zeros(1)
         if first > 0:
-            varied.append(value * (last / first) ** change)
+            values = value * (last / first) ** change
         else:
-            varied.append(value + _largest(motions)[form.largest] * (last - first) * change)
-    return _with_unit_peak(
-        [replace(law, shapes=tuple(map(float, each))) for each in itertools.product(*varied)], motions
-    )
+            values = value + _largest(motions)[form.largest] * (last - first) * change
+        varied.append(values.tolist())
+    return _with_unit_peak([replace(law, shapes=shapes) for shapes in itertools.product(*varied)], motions)
 
 
 def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
