@@ -64,7 +64,14 @@ def forms_of(fit: Fit, base: Solution) -> list[Difference]:
     if n_exponents == 1 and len({trial.vine for trial in trials}) > 1:
         forms.append(Difference(N_BY_VINE, shared={EXPONENT: "vine"}))
     enough = len(trials) >= FEWEST_TRIALS
-    forms += [*(_of_order(fit, base, trials) if enough else ()), *_groups(trials)]
+    forms += _of_order(fit, base, trials) if enough else ()
+    # Groups that columns of the sheet state; a vine with a single tube has its own B already.
+    tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
+    for name in BETWEEN:
+        if all(getattr(trial, name, "") for trial in trials):
+            alone = [name == SPECIMEN and tubes[trial.vine] == 1 for trial in trials]
+            groups = ["" if one else trial.group(name) for one, trial in zip(alone, trials, strict=True)]
+            forms += _forms(name, groups, trials)
     forms += _changes(fit, base, trials) if enough else ()
     n_forms = Counter(difference.name for difference in forms)
     return [replace(difference, n_forms=difference.n_forms * n_forms[difference.name]) for difference in forms]
@@ -103,19 +110,6 @@ def _of_order(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differe
 def _likeliest(fit: Fit, base: Solution, forms: Iterable[Difference]) -> Difference:
     """The form that gains most."""
     return max(forms, key=lambda form: linear_gain(fit, base, form, base.state.spread))
-
-
-def _groups(trials: Sequence[Trial]) -> list[Difference]:
-    """Differences between the specimens, days and other groups of trials that columns of the sheet state."""
-    found: list[Difference] = []
-    for name in BETWEEN:
-        if all(getattr(trial, name, "") for trial in trials):
-            groups = [trial.group(name) for trial in trials]
-            tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
-            # A vine with a single tube has its own B already.
-            alone = [name == SPECIMEN and tubes[trial.vine] == 1 for trial in trials]
-            found += _forms(name, ["" if one else group for one, group in zip(alone, groups, strict=True)], trials)
-    return found
 
 
 def _forms(name: str, groups: Sequence[str], trials: Sequence[Trial], *, stated: bool = True) -> list[Difference]:

@@ -103,7 +103,8 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     """Simulate the fitted motions with given trial effects. Shapes: trial_effects (n_trials, 4)."""
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta, trial_effects)
-    trials = [_trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
+    simulated = [_of_job(fit.model, data.trial, job) for data, job in zip(predictor.data, jobs, strict=True)]
+    models, trials = zip(*simulated, strict=True)
     # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [
         max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + 3.0 * trial_data.frame_s, 1e-6)
@@ -116,8 +117,7 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     ]
     runs = simulate_many(fit.model, trials, grids, traces=traces, parameters=jobs.row, host=predictor.host)
     motions = []
-    for trial, job, run, trace in zip(trials, jobs, runs, traces, strict=True):
-        model = fit.model.with_values(dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True)))
+    for model, trial, run, trace in zip(models, trials, runs, traces, strict=True):
         y, v = run.lead_position_m, run.lead_velocity_m_s
         measured = None if trace is None else np.interp(run.time_s, *trace)
         if measured is None and any("chamber_rate" in effect.functions for effect in model):
@@ -137,11 +137,12 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     return motions
 
 
-def _trial_of_job(trial: Trial, job: Jobs) -> Trial:
-    """The trial with the pressure and yield pressure that its job simulates."""
+def _of_job(model: Model, trial: Trial, job: Jobs) -> tuple[Model, Trial]:
+    """The model with the parameters of a job, and the trial with the pressure and yield pressure that it simulates."""
+    values = dict(zip(model.parameter_names, job.row.tolist(), strict=True))
     yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
     pressure_Pa = trial.pressure_Pa * (1 + float(job.pressure_deviation))
-    return replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
+    return model.with_values(values), replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
 
 
 def _accelerated(motion: FittedMotion, push: Push | None) -> tuple[FittedMotion, Floats]:
@@ -374,9 +375,8 @@ class ForceProblem:
 
     def _with_job(self, motion: FittedMotion, job: Jobs) -> FittedMotion:
         """The same motion, its model and trial with the parameters of a job."""
-        values = dict(zip(motion.model.parameter_names, job.row.tolist(), strict=True))
-        trial = _trial_of_job(self.data[int(job.trial)].trial, job)
-        return replace(motion, model=motion.model.with_values(values), trial=trial)
+        model, trial = _of_job(motion.model, self.data[int(job.trial)].trial, job)
+        return replace(motion, model=model, trial=trial)
 
 
 class ForceEquations:

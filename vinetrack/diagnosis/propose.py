@@ -295,7 +295,13 @@ def _fitted(
     """
     if not forces:
         return before, []
-    files = [_file_of(force) for force in forces]
+    files: list[tuple[str, str, Callable[[str], str]]] = []
+    for force in forces:
+        if isinstance(force, RankedLaw):
+            files.append((f"proposed_{force.law.name}", force.words, partial(effect_text, force)))
+        else:
+            name = "_".join(["learned", *force.domain.variables])
+            files.append((name, str(force.sentence), partial(table_text, force)))
     effects = []
     for name, _, text in files:
         path = folder / f"{name}.py"
@@ -308,15 +314,6 @@ def _fitted(
             ratio = likelihood_ratio(before, (effect,), fit_with(before, effect, report))
             found.append(Proposed(words, text, effect, ratio))
     return before, found
-
-
-def _file_of(force: RankedLaw | LearnedForce) -> tuple[str, str, Callable[[str], str]]:
-    """Name of the effect that holds a force, such as `proposed_time` or `learned_growth_speed`, its description, and
-    the source of its file by where it comes from.
-    """
-    if isinstance(force, RankedLaw):
-        return f"proposed_{force.law.name}", force.words, partial(effect_text, force)
-    return "_".join(["learned", *force.domain.variables]), str(force.sentence), partial(table_text, force)
 
 
 def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:

@@ -147,12 +147,17 @@ class Candidate(JsonRecord):
 StoredCandidate = Annotated[Candidate, PlainSerializer(Candidate.to_json)]
 
 
+@dataclass(frozen=True)
+class Cosines(JsonRecord):
+    """Correlations of the candidates' scores, with the fitted parameters projected off: a matrix in this order."""
+
+    effects: tuple[str, ...] = ()
+    matrix: Sequence[Sequence[OrNaN]] = ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Round(JsonRecord):
-    """One model and its tests against all candidates. `ranking` has the best candidate first, those not testable last.
-    `cosines` are the correlations of the candidates' scores, with the fitted parameters projected off: names, and a
-    matrix in their order.
-    """
+    """One model and its tests against all candidates. `ranking` has the best first, those not testable last."""
 
     model: tuple[str, ...] = ()
     verdict: str
@@ -161,25 +166,11 @@ class Round(JsonRecord):
     partial: tuple[StoredCandidate, ...] = ()
     explanation: str = ""
     ranking: tuple[StoredCandidate, ...] = ()
-    cosine_names: Annotated[tuple[str, ...], Field(alias="effects")] = ()
-    cosines: Annotated[Sequence[Sequence[OrNaN]], Field(alias="matrix")] = ()
+    cosines: Cosines = Cosines()
     fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None
     fits: Annotated[Mapping[str, InstanceOf[Fit]], Field(exclude=True)] = field(default_factory=dict)
     partial_fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """As an entry of `rounds`."""
-        entry = super().to_json()
-        cosines = {name: entry.pop(name) for name in ("effects", "matrix")}
-        return {**entry, "cosines": cosines}
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Round:
-        """Read an entry of `rounds`, which holds no fits."""
-        return super().from_json({**entry, **(entry.get("cosines") or {})})
-
-
-StoredRound = Annotated[Round, BeforeValidator(Round.from_json), PlainSerializer(Round.to_json)]
 
 StoredPower = Annotated[Power, BeforeValidator(Power.from_json), PlainSerializer(Power.to_json)]
 
@@ -197,7 +188,7 @@ class Diagnosis(JsonRecord):
     the initial model and every enlarged one.
     """
 
-    rounds: tuple[StoredRound, ...] = ()
+    rounds: tuple[Round, ...] = ()
     effects: tuple[str, ...] = ()
     explanation: str = ""
     fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
