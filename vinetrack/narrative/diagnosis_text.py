@@ -414,12 +414,9 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
         by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}[law.factor]
         form, place = f"{form}, times {by}", "{size} at its largest"
     scale = law.shapes[0] if law.shapes else math.nan
+    ends = {"low": f"{1e3 * max(scale, 0.0):.0f}", "high": f"{1e3 * sum(law.shapes):.0f}"}
     text = (f"{form}, {place}" if place else form).format(
-        size=size,
-        low=f"{1e3 * max(scale, 0.0):.0f}",
-        high=f"{1e3 * sum(law.shapes):.0f}",
-        milli=number(1e3 * scale),
-        scale=f"{scale:.2g}",
+        size=size, milli=number(1e3 * scale), scale=f"{scale:.2g}", **ends
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
 
@@ -527,8 +524,7 @@ def learned_file_text(learned: LearnedForce, origin: str) -> str:
              "pressure": ("P", "kPa", 1e-3)}  # fmt: skip
     ranges = [
         f"{_variables_text(axis.name)} from {axis.low * times:.3g} to {axis.high * times:.3g} {unit}"
-        for axis in domain.axes
-        for _, unit, times in [shown[axis.name]]
+        for axis, (_, unit, times) in ((axis, shown[axis.name]) for axis in domain.axes)
     ]
     validity = sentence("valid_where_learned", {"ranges": ranges})
     symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))
