@@ -194,10 +194,9 @@ def acceleration_sensitivities(
 
 def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Floats:
     """Values at the steps of a motion interpolated linearly. Shapes: since_s (n,); values (N_STEPS + 1, k) → (n, k)."""
-    k = np.clip(np.searchsorted(motion.time_s, since_s), 1, N_STEPS)
-    before_s, after_s = motion.time_s[k - 1], motion.time_s[k]
-    part = np.clip((since_s - before_s) / (after_s - before_s), 0.0, 1.0)[:, None]
-    return np.asarray(values[k - 1] + part * (values[k] - values[k - 1]))
+    from scipy.interpolate import make_interp_spline
+
+    return np.asarray(make_interp_spline(motion.time_s, values, k=1)(np.clip(since_s, 0.0, motion.time_s[-1])))
 
 
 def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:

@@ -67,12 +67,11 @@ class Failure:
     @property
     def fails(self) -> bool:
         """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
-        from scipy.stats import chi2, norm
+        from scipy.stats import combine_pvalues, norm
 
         # 3.0: significance, in standard deviations, from which a model is said to fail
         level, p = float(norm.sf(3.0)), norm.sf(self.by_condition["z"].to_numpy(float))
-        together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * p.size))
-        return bool(p.min() < level / p.size or together < level)
+        return bool(p.min() < level / p.size or combine_pvalues(np.maximum(p, 1e-300)).pvalue < level)
 
     def remarks(self) -> Iterator[Remark]:
         """Where the model fails most, by how much, and what drifts."""
@@ -310,28 +309,20 @@ MAX_DEVIATION = 3.0  # Largest deviation of ln B from the common value (chosen)
 
 @dataclass(frozen=True)
 class PerTrialEstimates:
-    """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `base` the common value, `deviation` that
-    of the best ln B of the trial from it, NaN where a trial does not depend on it; `variance` is that from a typical
-    scatter of pressure and B, up to a factor. `halves`, shape (n_trials, 2), are the best deviations in each half of
-    the growth, NaN where they are not known.
+    """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `vines` are blank where all have one B;
+    `base` is the common value, `deviation` that of the best ln B of the trial from it, NaN where a trial does not
+    depend on it; `variance` is that from a typical scatter of pressure and B, up to a factor. `halves`, shape
+    (n_trials, 2), are the best deviations in each half of the growth, NaN where they are not known.
     """
 
     number: Number
     trials: tuple[Trial, ...]
+    vines: NDArray[np.str_]
+    conditions: NDArray[np.str_]
     base: Floats
     deviation: Floats
     variance: Floats
     halves: Floats
-
-    @property
-    def vines(self) -> NDArray[np.str_]:
-        """Names of the vines of the trials; blank where all have one B."""
-        return np.array([trial.vine if self.number.vine else "" for trial in self.trials])
-
-    @property
-    def conditions(self) -> NDArray[np.str_]:
-        """Names of the conditions of the trials."""
-        return np.array([trial.condition for trial in self.trials])
 
 
 def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
@@ -373,9 +364,12 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
             halves[i] = trial_effects[i, DAMPING_DEVIATION] + change
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
     known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
+    number, trials = next(each for each in fit.numbers if each.key == DAMPING), tuple(each.trial for each in data)
     return PerTrialEstimates(
-        number=next(number for number in fit.numbers if number.key == DAMPING),
-        trials=tuple(trial_data.trial for trial_data in data),
+        number=number,
+        trials=trials,
+        vines=np.array([trial.vine if number.vine else "" for trial in trials]),
+        conditions=np.array([trial.condition for trial in trials]),
         base=predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
         deviation=np.where(known, trial_effects[:, DAMPING_DEVIATION], np.nan),
         variance=variance,

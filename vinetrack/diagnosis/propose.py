@@ -224,11 +224,6 @@ class Proposed:
     ratio: LikelihoodRatio
     rms_left_out_m: float = math.nan
 
-    @property
-    def log_likelihood(self) -> float:
-        """Ln L of its fit."""
-        return self.ratio.fit.log_likelihood
-
 
 @dataclass(frozen=True)
 class Proposal:
@@ -260,10 +255,10 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         before, laws = _fitted(before, best, Path(folder), report)
         report("errors on left-out conditions")
         error_m = left_out(before).rms_m
-        laws.sort(key=lambda law: -law.log_likelihood)
+        laws.sort(key=lambda law: -law.ratio.delta_chi2)
         laws = [
             replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
-            if 2 * (laws[0].log_likelihood - law.log_likelihood) < OUT_OF_REACH
+            if law.ratio.deviance_excess(laws[0].ratio) < OUT_OF_REACH
             else law
             for law in laws
         ]
@@ -272,8 +267,8 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
         reason = Remark() if tied else remark("no_law_predicts_better" if best else "no_law_detected")
         # The learned force as a table, where it explains what no law does
-        misfit, fits = before.chi2_per_dof - 1, [law.ratio.fit for law in tied]
-        remaining = min((fit.chi2_per_dof for fit in fits), default=before.chi2_per_dof) - 1
+        misfit = before.chi2_per_dof - 1
+        remaining = min((law.ratio.fit.chi2_per_dof for law in tied), default=before.chi2_per_dof) - 1
         # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
         is_open = misfit >= LEAST_CHI2_PER_POINT - 1 and remaining >= (1 - 0.9) * misfit
         tried = [force.learned] if force.learned is not None and is_open else []
@@ -282,7 +277,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
             replace(table, rms_left_out_m=left_out(table.ratio.fit).rms_m)
             for table in tables
             if _explains(start, table.ratio)
-            and all(2 * (table.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in fits)
+            and all(law.ratio.deviance_excess(table.ratio) > ANSWER_SET_DELTA_CHI2 for law in tied)
         ]
     return Proposal(before, error_m, tuple(laws), tied, reason, next(iter(tables), None))
 
