@@ -529,9 +529,9 @@ def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_m
 
 def test_a_force_narrower_than_a_millimetre_or_far_beyond_drive_and_weight_is_not_named():
     estimate = ForceEstimate(100.0, np.array([-20.0]), 1.0, 1)
-    law = Law("patch", low=0.274, high=0.294)
+    law = Law("patch", (0.274, 0.02))
     assert RankedLaw(law, estimate, 0.0, largest_N=50.0).is_detected
     absurd = estimate._replace(amplitude=np.array([-1.6e6]), sigma=10.0)
     assert not RankedLaw(law, absurd, 0.0, largest_N=50.0).is_detected
     assert not law.is_unresolved
-    assert replace(law, low=-2e-3, high=4e-4).is_unresolved
+    assert replace(law, shapes=(-2e-3, 2.4e-3)).is_unresolved

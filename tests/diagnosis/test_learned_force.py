@@ -15,15 +15,15 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis import force_inversion as inversion
 from vinetrack.diagnosis import force_laws as laws
 from vinetrack.diagnosis import missing_force as learning
-from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
-from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_text
+from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, missing_force
+from vinetrack.diagnosis.propose import effect_text, propose, table_text
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference import gaussian_processes as smooth
 from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
-GROWTH = learning.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
+GROWTH = learning.Domain((learning.Axis("growth", 0.0, 0.25, 12),))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
@@ -57,7 +57,7 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
     size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
     assert size.value == pytest.approx(1.0, abs=0.1)
     assert table.ratio.fit.chi2_per_dof < 1.5 < proposal.before.chi2_per_dof
-    learned = table.learned
+    learned = missing_force(proposal.before).learned
     assert learned.domain.variables == ("growth",)
     assert sum(learned.weights.values()) == pytest.approx(1.0)
     grid = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
@@ -110,18 +110,18 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, 401)[None]
     pushed = np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1))
-    moved, sped = inversion.integrate_responses(time_s, *pushed, inversion.SDIRK_GAMMA)
+    moved, sped = inversion.integrate_responses(time_s, *pushed)
     assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
     # A spring far too stiff for the steps is at rest there: the method is L-stable.
-    stiff, _ = inversion.integrate_responses(time_s, -1e10 + 0 * time_s, *pushed[1:], inversion.SDIRK_GAMMA)
+    stiff, _ = inversion.integrate_responses(time_s, -1e10 + 0 * time_s, *pushed[1:])
     assert stiff[0, -1, 0] == pytest.approx(1e-10)
 
 
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
-    slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
-    tracks, theta = slowed.tracks, slowed.tracks.theta
+    slowed = inversion.ForceProblem(vt.fit(vt.base_model(), pairs, profile=False))
+    tracks, theta = slowed.start, slowed.start.theta
     domains = learning.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))
     growth, pressure = (smooth.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
@@ -165,11 +165,11 @@ def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_conditio
     low, high = (float(word) for word in best["words"].split(" mm")[0].split("between ")[1].split(" and "))
     assert (low, high) == pytest.approx((120, 150), abs=2)
     assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
-    assert set(patch.table["against"]) == {"lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"}
-    along = patch.table[(patch.table["against"] == "lead_position_m") & (patch.table["condition"] != "")]
+    along = patch.table[patch.table["condition"] != ""]
+    assert along[["lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"]].notna().all(axis=None)
     for _, one in along.groupby("condition"):
         lowest = one.loc[one["force_N"].idxmin()]
-        assert 0.1 < lowest["value"] < 0.17
+        assert 0.1 < lowest["lead_position_m"] < 0.17
         assert -0.7 < lowest["force_N"] - one["force_N"].median() < -0.2
 
 
@@ -212,13 +212,15 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
             moved.append(simulate_many(with_force, trials, times, parameters=rows, relative_tolerance=1e-7))
         for answer, more, less in zip(answers, *moved, strict=True):
             exact = (more.observed_position_m - less.observed_position_m) / 2e-3
-            assert np.max(np.abs(answer[:, k] - exact)) < 2e-3 * np.max(np.abs(exact))
+            ended = (more.time_s >= more.end_time_s) | (less.time_s >= less.end_time_s)  # NaN: growth goes on
+            off = (answer[:, k] - exact)[~ended]
+            assert np.max(np.abs(off)) < 2e-3 * np.max(np.abs(exact))
 
 
 DOMAINS = [
-    learning.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
-    learning.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
-    learning.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 24),)),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8))),
+    learning.Domain((learning.Axis("time", 0.0, 0.4, 8), learning.Axis("pressure", 1e4, 3e4, 5))),
 ]
 
 
@@ -228,21 +230,18 @@ def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4, "is_visited": True}
     motion = SimpleNamespace(**{name: np.array([value]) for name, value in where.items()})
     motion.trial = SimpleNamespace(condition="one")
-    found, lengths = smooth.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
-    weights = {domain.name: 1.0}
-    return learning.LearnedForce(
-        domain, found, learning.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, True
-    )
+    found, weights = smooth.Posterior(*known, 50.0, 0, 0.1), {domain.name: 1.0}
+    return learning.LearnedForce(domain, found, [motion], weights, (), 50.0, 0.99, True)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
 def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain, tmp_path):
     force = learned(domain, 4)
-    path = tmp_path / f"{table_name(force)}.py"
+    path = tmp_path / "learned.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
     effect = own_effects([path])[path.stem]
-    draw, ends = np.random.default_rng(5), zip(domain.low, domain.high, strict=True)
-    at = [draw.uniform(low - 0.1 * (high - low), high * 1.2, 40) for low, high in ends]
+    draw = np.random.default_rng(5)
+    at = [draw.uniform(axis.low - 0.1 * (axis.high - axis.low), axis.high * 1.2, 40) for axis in domain.axes]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
     expected = domain.basis(at) @ force.found.mean
@@ -256,16 +255,16 @@ SCALES = {"falling_with_speed": 1.5, "fading_in_time": 0.04, "fading_along": 0.0
 BEYOND = {"beyond_a_place": (0.06, 0.1), "beyond_a_speed": (1.2, 7.8), "squared_beyond_a_speed": (1.2, 61.0)}
 LAWS = [
     *(laws.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
-    *(laws.Law(name, scale=scale) for name, scale in SCALES.items()),
-    *(laws.Law(name, scale=scale, peak=peak) for name, (scale, peak) in BEYOND.items()),
+    *(laws.Law(name, (scale,)) for name, scale in SCALES.items()),
+    *(laws.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
     laws.Law("speed", peak=9.0, reference_area_m2=3e-4),
-    laws.Law("inverse_speed", scale=2.5, peak=1.7),
-    laws.Law("patch", low=0.08, high=0.11),
+    laws.Law("inverse_speed", (2.5,), peak=1.7),
+    laws.Law("patch", (0.08, 0.03)),
     laws.Law("position", factor="speed", peak=4.0),
-    laws.Law("patch", low=0.08, high=0.11, factor="pressure", peak=3e4),
-    laws.Law("falling_with_speed", scale=1.5, factor="position"),
+    laws.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
+    laws.Law("falling_with_speed", (1.5,), "position"),
     laws.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    laws.Law("periodic", scale=0.03),
+    laws.Law("periodic", (0.03, 0.0)),
 ]
 
 

@@ -217,7 +217,7 @@ def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
         told = {vine: {"yield_pressure_Pa": P_y, "yield_pressure_sigma_Pa": 300.0} for vine, P_y in stated.items()}
         misread = [(replace(trial, **told[trial.vine]), track) for trial, track in pairs]
         fit = vt.fit(vt.base_model(), misread, profile=False)
-        z += [test.row["z"] for test in against_the_sheet(fit)]
+        z += [test["z"] for test in against_the_sheet(fit)]
     assert math.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.3)
 
 

@@ -13,9 +13,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,92 +57,57 @@ FEWEST_TRIALS = 6  # Number of trials from which drifts and changes are tested (
 
 def forms_of(fit: Fit, base: Solution) -> list[Difference]:
     """List every form of every hypothesis that these trials can test."""
-    trials = [trial.trial for trial in fit.trials]
-    forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
-    forms += _changes(fit, base, trials)
+    trials, forms = [trial.trial for trial in fit.trials], list[Difference]()
+    n_exponents = sum(number.key == EXPONENT for number in fit.predictor.layout.free)
+    if n_exponents == 1 and len({trial.vine for trial in trials}) > 1:
+        forms.append(Difference(N_BY_VINE, shared={EXPONENT: "vine"}))
+    enough = len(trials) >= FEWEST_TRIALS
+    forms += _of_order(fit, base, trials) if enough else ()
+    # Groups that columns of the sheet state; a vine with a single tube has its own B already.
+    tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
+    for name in BETWEEN:
+        if all(getattr(trial, name, "") for trial in trials):
+            alone = [name == SPECIMEN and tubes[trial.vine] == 1 for trial in trials]
+            groups = ["" if one else trial.group(name) for one, trial in zip(alone, trials, strict=True)]
+            forms += _forms(name, groups, trials)
+    forms += _changes(fit, base, trials) if enough else ()
     n_forms = Counter(difference.name for difference in forms)
     return [replace(difference, n_forms=difference.n_forms * n_forms[difference.name]) for difference in forms]
 
 
-def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
-    """An exponent n for each vine, where several vines share one."""
-    free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
-    if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
-        return []
-    return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
-
-
-def _drifts(trials: Sequence[Trial]) -> list[Difference]:
-    """Drift of ln B with the earlier trials of the same tube, and of ln P with all earlier trials."""
-    if len(trials) < FEWEST_TRIALS:
-        return []
+def _of_order(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Drift of ln B with the earlier trials of the same tube, and of ln P with all earlier trials; and a step of ln P
+    from the likeliest trial on, as where a regulator is set again.
+    """
     ranks, stated = trial_order(trials)
     uses, count = np.zeros(ranks.size), Counter[str]()
     for i in np.argsort(ranks):
         uses[i] = count[trials[i].group(SPECIMEN)]
         count[trials[i].group(SPECIMEN)] += 1
-    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
-    forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
-    return [
-        Difference(
-            ORDER_DRIFT,
-            (
-                BetweenTerm(
-                    f"{ORDER_DRIFT}.{name}", symbol, "1/trial", name == "P", ("all",) * ranks.size, past, scale=0.01
-                ),
-            ),
-            stated=stated,
-            confounded=confounded(past[:, None], trials),
-        )
-        for name, symbol, past in forms
-        if past.any()
-    ]
+    driven = all(trial.pressure_Pa > 0 for trial in trials)
 
+    def form(key: str, symbol: str, unit: str, groups: Sequence[str], regressor: Floats) -> Difference:
+        term = BetweenTerm(f"{ORDER_DRIFT}.{key}", symbol, unit, key != "B", tuple(groups), regressor, scale=0.01)
+        varying = np.where([bool(group) for group in groups], regressor, 0.0)[:, None]
+        return Difference(ORDER_DRIFT, (term,), stated=stated, confounded=confounded(varying, trials))
 
-def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Step of ln P from the likeliest trial on, as where a regulator is set again."""
-    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    def step(first: int) -> Difference:
+        begin = trials[int(np.argsort(ranks)[first])]
+        groups = [f"from {begin.name} on" if rank >= first else "" for rank in ranks]
+        return form("step", "ΔlnP", "", groups, np.ones(ranks.size))
+
+    every = ("all",) * ranks.size
+    drifts = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if driven else (("B", "dlnB", uses),)
+    forms = [form(key, symbol, "1/trial", every, past) for key, symbol, past in drifts if past.any()]
     begins = range(MIN_TRIALS_EACH_SIDE, len(trials) - MIN_TRIALS_EACH_SIDE + 1)
-    if len(trials) < FEWEST_TRIALS or not np.all(pressures_Pa > 0):
-        return []
-    ranks, stated = trial_order(trials)
-    ordered = [int(i) for i in np.argsort(ranks)]
-    best = _likeliest(fit, base, begins, lambda first: _step(ordered[first:], trials))
-    return [replace(best, stated=stated, n_forms=len(begins))]
+    if driven:
+        forms.append(replace(_likeliest(fit, base, map(step, begins)), n_forms=len(begins)))
+    return forms
 
 
-def _likeliest(fit: Fit, base: Solution, begins: range, form_of: Callable[[int], Difference]) -> Difference:
-    """The difference that begins where it gains most: of twenty places or so, then of all about the best of these."""
-
-    def gain(first: int) -> float:
-        return linear_gain(fit, base, form_of(first), base.state.spread)
-
-    stride = len(begins) // 20 + 1
-    near = max(begins[::stride], key=gain)
-    return form_of(max(range(max(near - stride + 1, begins[0]), min(near + stride, begins[-1] + 1)), key=gain))
-
-
-def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
-    """Step of ln P of some trials, in the order in which they were made, relative to the others."""
-    groups = [""] * len(trials)
-    for i in members:
-        groups[i] = f"from {trials[members[0]].name} on"
-    term = BetweenTerm(f"{ORDER_DRIFT}.step", "ΔlnP", "", True, tuple(groups), np.ones(len(trials)), scale=0.01)
-    member = np.array([[float(bool(group))] for group in groups])
-    return Difference(ORDER_DRIFT, (term,), confounded=confounded(member, trials))
-
-
-def _groups(trials: Sequence[Trial]) -> list[Difference]:
-    """Differences between the specimens, days and other groups of trials that columns of the sheet state."""
-    found: list[Difference] = []
-    for name in BETWEEN:
-        if all(getattr(trial, name, "") for trial in trials):
-            groups = [trial.group(name) for trial in trials]
-            tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
-            # A vine with a single tube has its own B already.
-            alone = [name == SPECIMEN and tubes[trial.vine] == 1 for trial in trials]
-            found += _forms(name, ["" if one else group for one, group in zip(alone, groups, strict=True)], trials)
-    return found
+def _likeliest(fit: Fit, base: Solution, forms: Iterable[Difference]) -> Difference:
+    """The form that gains most."""
+    return max(forms, key=lambda form: linear_gain(fit, base, form, base.state.spread))
 
 
 def _forms(name: str, groups: Sequence[str], trials: Sequence[Trial], *, stated: bool = True) -> list[Difference]:
@@ -171,38 +135,25 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
     """Changes of tube where specimens are not stated: from some trial of each vine on, or with each condition. A tube
     for each condition is possible only where replicates were made consecutively.
     """
-    if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
+    if all(trial.specimen for trial in trials):
         return []
     ranks, _ = trial_order(trials)
     groups = [""] * len(trials)
     for vine in dict.fromkeys(trial.vine for trial in trials):
         members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
-        begins = range(MIN_TRIALS_EACH_SIDE, len(members) - MIN_TRIALS_EACH_SIDE + 1)
-        if not begins:
-            continue
-        tube = f"{vine}, later tube"
-        later = partial(_later_tube, members, tube, groups, trials)
-        groups = list(_likeliest(fit, base, begins, later).terms[0].groups)
+        later = []
+        for first in range(MIN_TRIALS_EACH_SIDE, len(members) - MIN_TRIALS_EACH_SIDE + 1):
+            after = set(members[first:])
+            apart = [f"{vine}, later tube" if i in after else group for i, group in enumerate(groups)]
+            later.append(_forms(SPECIMEN, apart, trials, stated=False)[-1])
+        if later:
+            groups = list(_likeliest(fit, base, later).terms[0].groups)
     conditions = [trial.condition for trial in trials]
     changes = _forms(SPECIMEN, groups, trials, stated=False) if any(groups) else []
-    if _replicates_are_consecutive(ranks, conditions):
+    made = [conditions[i] for i in np.argsort(ranks)]
+    if 1 < len(set(made)) == len(list(itertools.groupby(made))) < len(made):
         changes += _forms(SPECIMEN, conditions, trials, stated=False)
     return changes
-
-
-def _later_tube(
-    members: Sequence[int], tube: str, groups: Sequence[str], trials: Sequence[Trial], first: int
-) -> Difference:
-    """Another tube for the later trials of a vine, beside those of the vines before."""
-    apart = [tube if i in members[first:] else group for i, group in enumerate(groups)]
-    return _forms(SPECIMEN, apart, trials, stated=False)[-1]
-
-
-def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> bool:
-    """Whether the replicates of every condition were made consecutively."""
-    ordered = [conditions[i] for i in np.argsort(ranks)]
-    changes = sum(before != after for before, after in itertools.pairwise(ordered))
-    return 1 < len(set(conditions)) == changes + 1 < len(conditions)
 
 
 def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
@@ -242,10 +193,13 @@ def differences(fit: Fit) -> list[Difference]:
     base = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
     best: dict[str, Difference] = {}
     for difference in forms_of(fit, base):
-        estimated = _estimated(fit, base, difference)
-        if estimated is not None and (
-            difference.name not in best or estimated.penalised_gain > best[difference.name].penalised_gain
-        ):
+        gain = linear_gain(fit, base, difference)
+        if not math.isfinite(gain):
+            continue
+        p = gain_p_value(fit, difference, gain)
+        estimated = replace(difference, gain=gain, p=min(p * difference.n_forms, 1.0))
+        known = best.get(difference.name)
+        if known is None or estimated.penalised_gain > known.penalised_gain:
             best[difference.name] = estimated
     return list(best.values())
 
@@ -268,8 +222,12 @@ def between_fits(
         if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(40.0, 0.3 * best):
             continue
         report(f"fitting {difference.name}")
-        fit = _fitted(before, difference)
-        if fit is None:
+        between = (*before.predictor.layout.between, *difference.terms)
+        try:
+            # 14, 30: iterations of the fit of a difference, at first and in all (chosen)
+            fit = refit(before, between=between, shared=difference.shared, most_iterations=14)
+            fit = fit if fit.converged else refit(fit, most_iterations=30)
+        except (FitError, SimulationError, np.linalg.LinAlgError):
             continue
         # Exponents of several vines are as many sizes, less the one they had; random effects are integrated out.
         sizes = max(len(fit.numbers) - len(before.numbers), 1) if difference.shared else 1
@@ -283,40 +241,18 @@ def between_fits(
 
 def _effect_of(difference: Difference) -> Effect:
     """The difference in the form of an effect, for the tables of candidates and the answer set."""
-    drift = tuple(
-        Parameter(name, term.symbol, term.unit, 0.0, plausible=(-PLAUSIBLE_DRIFT[name], PLAUSIBLE_DRIFT[name]))
-        for term in difference.terms
-        for name in [term.key.split(".")[1]]
-        if difference.name == ORDER_DRIFT
-    )
-    keys = [term.key for term in difference.terms] or list(difference.shared)
-    parameters = tuple(Parameter(key.split(".")[1], key, "", 0.0) for key in keys)
+    described = [(term.key, term.symbol, term.unit) for term in difference.terms]
+    parameters = []
+    for key, symbol, unit in described or [(key, key, "") for key in difference.shared]:
+        name = key.split(".")[1]
+        limit = PLAUSIBLE_DRIFT[name] if difference.name == ORDER_DRIFT else 0.0
+        parameters.append(Parameter(name, symbol, unit, 0.0, plausible=(-limit, limit) if limit else None))
     return Effect(
         name=difference.name,
         kind=BETWEEN_TRIALS,
         summary=BETWEEN[difference.name].summary,
         text=BETWEEN[difference.name].summary,
-        parameters=drift or parameters,
+        parameters=tuple(parameters),
         functions={},
         path=Path(difference.name),
     )
-
-
-def _estimated(fit: Fit, base: Solution, difference: Difference) -> Difference | None:
-    """The difference with its predicted gain and p-value; None where the gain is not finite."""
-    gain = linear_gain(fit, base, difference)
-    if not math.isfinite(gain):
-        return None
-    p = gain_p_value(fit, difference, gain)
-    return replace(difference, gain=gain, p=min(p * difference.n_forms, 1.0))
-
-
-def _fitted(before: Fit, difference: Difference) -> Fit | None:
-    """Fit of the difference; None where the fit fails."""
-    between = (*before.predictor.layout.between, *difference.terms)
-    try:
-        # 14, 30: iterations of the fit of a difference, at first and in all (chosen)
-        fit = refit(before, between=between, shared=difference.shared, most_iterations=14)
-        return fit if fit.converged else refit(fit, most_iterations=30)
-    except (FitError, SimulationError, np.linalg.LinAlgError):
-        return None

@@ -40,6 +40,7 @@ from vinetrack.diagnosis.result import (
     SCREENED,
     UNEXPLAINED,
     Candidate,
+    Cosines,
     Diagnosis,
     Round,
 )
@@ -159,15 +160,13 @@ def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mappin
 
 def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     tests = step.tests
-    names, cosines = _cosines(tests)
     return Round(
         model=tests.fit.model.names,
         verdict=step.verdict,
         answer_set=step.answer_names,
         ranking=tuple(_ranking(step, not_testable)),
         explanation=in_words(step),
-        cosine_names=names,
-        cosines=cosines,
+        cosines=_cosines(tests),
         fit=tests.fit,
         fits={
             hypothesis.names[-1]: hypothesis.fit
@@ -202,12 +201,12 @@ def _partial_candidates(step: SelectionStep) -> tuple[Candidate, ...]:
     return tuple(candidates)
 
 
-def _cosines(tests: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
+def _cosines(tests: MisfitTests) -> Cosines:
     """Cosines between effects, each in the shape of the largest predicted gain."""
     names = tuple(dict.fromkeys(tests.sensitivities.effects))
     best_shapes = [tests.ranked_shapes(name)[0] for name in names]
     matrix = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
-    return names, matrix.tolist()
+    return Cosines(names, matrix.tolist())
 
 
 def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Candidate]:
@@ -324,7 +323,7 @@ def _located(result: Diagnosis) -> Diagnosis:
 
     failure = locate(result.fits[0])
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
-    return replace(result, failure=failure, where=failure.remarks(), drift=drift)
+    return replace(result, failure=failure, where=tuple(failure.remarks()), drift=drift)
 
 
 def _with_missing_force(result: Diagnosis) -> Diagnosis:

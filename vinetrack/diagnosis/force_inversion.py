@@ -23,14 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.threads import njit
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, replicate_scatter, residual_courses
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.gaussian_processes import splines, whiten
+from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, root_of_covariance, splines, whiten
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     eliminated,
@@ -39,40 +38,6 @@ from vinetrack.inference.marginal_likelihood import (
 )
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
-
-# ------------------------------------------------------------------------------
-# Compiled integration of the variational equations: responses of motions to small accelerations.
-
-
-@njit(nogil=True, error_model="numpy")
-def integrate_responses(
-    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
-) -> tuple[Floats, Floats]:
-    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
-    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
-    Anal. 14, 1006 (1977). Returns position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and
-    m/s. Shapes: time_s, stiffness, friction (n_trials, n_steps + 1); acceleration (n_trials, n_steps + 1, n).
-    """
-    trials, points, count = acceleration.shape
-    position_change, velocity_change = np.zeros_like(acceleration), np.zeros_like(acceleration)
-    for trial in range(trials):
-        for i in range(points - 1):
-            h = time_s[trial, i + 1] - time_s[trial, i]
-            implicit, explicit = gamma * h, (1 - gamma) * h
-            k, c = stiffness[trial, i + 1], friction[trial, i + 1]
-            k_stage = (1 - gamma) * stiffness[trial, i] + gamma * k
-            c_stage = (1 - gamma) * friction[trial, i] + gamma * c
-            pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
-            pivot = 1 - implicit * c - implicit * implicit * k
-            for j in range(count):
-                x, v, a = position_change[trial, i, j], velocity_change[trial, i, j], acceleration[trial, i + 1, j]
-                a_stage = (1 - gamma) * acceleration[trial, i, j] + gamma * a
-                rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
-                x, v = x + explicit * (v + implicit * rate), v + explicit * rate
-                v_end = v + implicit * ((k * (x + implicit * v) + c * v + a) / pivot)
-                position_change[trial, i + 1, j], velocity_change[trial, i + 1, j] = x + implicit * v_end, v_end
-    return position_change, velocity_change
-
 
 # ------------------------------------------------------------------------------
 # Motions, and the sensitivities of their positions to a small added force on the tail.
@@ -85,8 +50,6 @@ def integrate_responses(
 # for them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`).
 
 N_STEPS = 400  # Steps of a motion, denser at its start (derived)
-
-SDIRK_GAMMA = 1 - 1 / math.sqrt(2)  # Diagonal coefficient of `integrate_responses` (derived)
 
 # Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
@@ -109,7 +72,6 @@ class FittedMotion:
     acceleration: Floats
     observed_slope: Floats
     observation_offset_m: Floats
-    end_s: float
     counts_until_s: float
     pressure_Pa: Floats
     mass_kg: Floats
@@ -141,7 +103,8 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     """Simulate the fitted motions with given trial effects. Shapes: trial_effects (n_trials, 4)."""
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta, trial_effects)
-    trials = [_trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
+    simulated = [_of_job(fit.model, data.trial, job) for data, job in zip(predictor.data, jobs, strict=True)]
+    models, trials = zip(*simulated, strict=True)
     # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [
         max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + 3.0 * trial_data.frame_s, 1e-6)
@@ -153,38 +116,33 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
         for trial_data, job in zip(predictor.data, jobs, strict=True)
     ]
     runs = simulate_many(fit.model, trials, grids, traces=traces, parameters=jobs.row, host=predictor.host)
-    return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
+    motions = []
+    for model, trial, run, trace in zip(models, trials, runs, traces, strict=True):
+        y, v = run.lead_position_m, run.lead_velocity_m_s
+        measured = None if trace is None else np.interp(run.time_s, *trace)
+        if measured is None and any("chamber_rate" in effect.functions for effect in model):
+            # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher
+            # order.
+            measured = evaluate(model, trial, run.time_s, y, v).pressure_Pa
+        # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
+        velocity = np.gradient(y, run.time_s)
+        moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
+        by_time = np.gradient(run.observed_position_m, run.time_s)
+        slope, nothing = np.where(moving, by_time / np.where(moving, velocity, 1.0), 1.0), np.zeros_like(y)
+        offset_m, terms = run.observed_position_m - y, [nothing] * 5  # Terms are evaluated next
+        motion = with_terms(
+            FittedMotion(trial, model, measured, run.time_s, y, v, nothing, slope, offset_m, math.inf, *terms)
+        )
+        motions.append(replace(motion, acceleration=motion.model_acceleration))
+    return motions
 
 
-def _trial_of_job(trial: Trial, job: Jobs) -> Trial:
-    """The trial with the pressure and yield pressure that its job simulates."""
+def _of_job(model: Model, trial: Trial, job: Jobs) -> tuple[Model, Trial]:
+    """The model with the parameters of a job, and the trial with the pressure and yield pressure that it simulates."""
+    values = dict(zip(model.parameter_names, job.row.tolist(), strict=True))
     yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
     pressure_Pa = trial.pressure_Pa * (1 + float(job.pressure_deviation))
-    return replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
-
-
-def _motion(
-    model: Model, trial: Trial, job: Jobs, run: Trajectory, trace: tuple[Floats, Floats] | None
-) -> FittedMotion:
-    model = model.with_values(dict(zip(model.parameter_names, job.row.tolist(), strict=True)))
-    measured = None if trace is None else np.interp(run.time_s, *trace)
-    if measured is None and any("chamber_rate" in effect.functions for effect in model):
-        # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher order.
-        measured = evaluate(model, trial, run.time_s, run.lead_position_m, run.lead_velocity_m_s).pressure_Pa
-    # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
-    velocity = np.gradient(run.lead_position_m, run.time_s)
-    moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
-    slope = np.where(moving, np.gradient(run.observed_position_m, run.time_s) / np.where(moving, velocity, 1.0), 1.0)
-    zeros = np.zeros_like(run.time_s)
-    motion = with_terms(
-        FittedMotion(
-            trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros, slope,
-            run.observed_position_m - run.lead_position_m,
-            end_s=run.end_time_s if run.status == "ended" else math.inf, counts_until_s=math.inf,
-            pressure_Pa=zeros, mass_kg=zeros, model_acceleration=zeros, stiffness=zeros, friction=zeros,
-        )
-    )  # fmt: skip
-    return replace(motion, acceleration=motion.model_acceleration)
+    return model.with_values(values), replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
 
 
 def _accelerated(motion: FittedMotion, push: Push | None) -> tuple[FittedMotion, Floats]:
@@ -230,28 +188,45 @@ def acceleration_sensitivities(
         observed = _between_steps(
             motion, since_s, response * motion.observed_slope[:, None] / motion.trial.travel_ratio
         )
-        growing = (since_s > 0) & (since_s <= motion.end_s)
-        sensitivities.append(np.where(growing[:, None], observed, 0.0))
+        sensitivities.append(np.where(since_s[:, None] > 0, observed, 0.0))
     return sensitivities
 
 
 def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Floats:
     """Values at the steps of a motion interpolated linearly. Shapes: since_s (n,); values (N_STEPS + 1, k) → (n, k)."""
-    k = np.clip(np.searchsorted(motion.time_s, since_s), 1, N_STEPS)
-    before_s, after_s = motion.time_s[k - 1], motion.time_s[k]
-    part = np.clip((since_s - before_s) / (after_s - before_s), 0.0, 1.0)[:, None]
-    return np.asarray(values[k - 1] + part * (values[k] - values[k - 1]))
+    from scipy.interpolate import make_interp_spline
+
+    return np.asarray(make_interp_spline(motion.time_s, values, k=1)(np.clip(since_s, 0.0, motion.time_s[-1])))
 
 
 def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:
     """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
-    time_s, k, c = (
-        np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction")
-    )
-    dx, dv = integrate_responses(time_s, k, c, np.array(accelerations), SDIRK_GAMMA)
-    # Compiled code does not raise on overflow.
-    if np.geterr()["over"] == "raise" and not (np.isfinite(dx).all() and np.isfinite(dv).all()):
-        raise FloatingPointError("the response to a force is not finite")
+    time_s, k, c = (np.array([getattr(each, name) for each in motions]) for name in ("time_s", "stiffness", "friction"))
+    return integrate_responses(time_s, k, c, np.array(accelerations))
+
+
+def integrate_responses(
+    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats
+) -> tuple[Floats, Floats]:
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
+    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
+    Anal. 14, 1006 (1977). Returns changes of position, m, and velocity, m/s, (n_trials, n_times, n). Shapes: time_s,
+    stiffness, friction (n_trials, n_times); acceleration (n_trials, n_times, n).
+    """
+    gamma = 1 - 1 / math.sqrt(2)  # Its diagonal coefficient (derived)
+    courses = stiffness[:, :, None], friction[:, :, None], acceleration
+    dx, dv = np.zeros_like(acceleration), np.zeros_like(acceleration)
+    x, v = dx[:, 0], dv[:, 0]
+    for i, h in enumerate(np.diff(time_s).T[:, :, None]):
+        implicit, explicit = gamma * h, (1 - gamma) * h
+        k, c, a = (each[:, i + 1] for each in courses)
+        k_stage, c_stage, a_stage = ((1 - gamma) * each[:, i] + gamma * each[:, i + 1] for each in courses)
+        pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
+        rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
+        x, v = x + explicit * (v + implicit * rate), v + explicit * rate
+        v = v + implicit * ((k * (x + implicit * v) + c * v + a) / (1 - implicit * c - implicit * implicit * k))
+        x = x + implicit * v
+        dx[:, i + 1], dv[:, i + 1] = x, v
     return dx, dv
 
 
@@ -273,59 +248,40 @@ def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> Fitted
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
-# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
-# with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4), which takes a release that is a frame
-# off for noise. It is not used as data: the equation of motion is linearised about this motion, and
+# The acceleration of every trial is a smooth function of time, a Gaussian process, integrated twice from rest at its
+# release and fitted to positions. It is not used as data: the equation of motion is linearised about this motion, and
 # the defect there (what the model's forces lack) enters as one more known acceleration, so that noise in the smoothed
 # motion cancels to first order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a
 # large force the linearisation would be poor.
 
 
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
+    from scipy.integrate import cumulative_trapezoid
+
     since_s = data.time_s - trial_effects[RELEASE]
     position_m = data.lead_position_m - trial_effects[ORIGIN]
     position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
     growing = (since_s > 0) & ~(position_m > MOST_OF_LENGTH * motion.trial.length_m)
     if np.count_nonzero(growing) <= 2:
         return motion
-    last_s = float(since_s[growing].max())
-    # 20: splines, even in the square root of time and so denser where a vine accelerates (chosen)
-    accelerations = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), 20)
-    velocities = _integrated(motion.time_s, accelerations)
-    positions = _integrated(motion.time_s, velocities)
-    coefficients = _smoothed(_between_steps(motion, since_s[growing], positions), position_m[growing])
+    last_s, count = float(since_s[growing].max()), 20  # Splines (chosen)
+    # Even in the square root of time, and so denser where a vine accelerates
+    accelerations = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), count)
+    velocities = cumulative_trapezoid(accelerations, motion.time_s, axis=0, initial=0)
+    positions = cumulative_trapezoid(velocities, motion.time_s, axis=0, initial=0)
+    rows = np.column_stack([_between_steps(motion, since_s, positions), position_m])[growing]
+    products = rows.T @ rows / data.mean_noise_m**2
+    # Amplitudes, in parts of the acceleration that would be the same throughout (chosen)
+    amplitudes = 2 * rows[:, -1].max() / last_s**2 * np.geomspace(0.1, 30, 9)
+    priors = [root_of_covariance(count, length) for length in LENGTH_SCALES]
+    coefficients = posterior(products[:-1, :-1], products[:-1, -1], priors, amplitudes).mean
     return replace(
         motion,
         lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
         lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
         acceleration=motion.trial.travel_ratio * (accelerations @ coefficients),
-        # The model's end of growth is not that of the track: the vine responds to forces beyond it.
-        end_s=math.inf,
         counts_until_s=last_s,
     )
-
-
-def _smoothed(design: Floats, values: Floats) -> Floats:
-    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
-    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
-    gram = design.T @ design
-    unit = float(np.trace(gram)) / design.shape[1]
-    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
-    found = []
-    # Penalties, relative to the information from positions (chosen)
-    for penalty in np.geomspace(1e-8, 1e2, 21):
-        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
-        coefficients = inverse @ (design.T @ values)
-        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
-        squares = float(np.sum((values - design @ coefficients) ** 2))
-        found.append((squares / (values.size - degrees_of_freedom) ** 2, coefficients))
-    return min(found, key=lambda each: each[0])[1]
-
-
-def _integrated(time_s: Floats, columns: Floats) -> Floats:
-    """Cumulative integrals of the columns by the trapezoidal rule, 0 at the first time."""
-    steps = 0.5 * (columns[1:] + columns[:-1]) * np.diff(time_s)[:, None]
-    return np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(steps, axis=0)])
 
 
 # ------------------------------------------------------------------------------
@@ -366,17 +322,19 @@ class ForceEstimate(NamedTuple):
 class ForceProblem:
     """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
     noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
-    have the standard deviations estimated from replicates. At its fitted parameters, `tracks` are the motions that lie
-    on the tracks, whatever the model says, and `fitted` those of the model.
+    have the standard deviations estimated from replicates. `start` has the fitted parameters, and motions that lie on
+    the tracks, whatever the model says.
     """
 
-    def __init__(self, fit: Fit, scatter: Scatter) -> None:
-        self.fit, self.data, self.scatter = fit, fit.predictor.data, scatter
+    def __init__(self, fit: Fit) -> None:
+        self.fit, self.data = fit, fit.predictor.data
+        self.scatter = replicate_scatter(fit, residual_courses(fit)[0])
         self.prior = fit.solution.problem
         self.rho = track_correlation(self.data)
         noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - self.rho**2)
         self.variance = np.maximum(noise, variance_floor(self.data))
-        spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
+        least, scatter = LEAST_BETWEEN_TRIAL_SD, self.scatter
+        spread = (max(scatter.pressure, least[0]), max(scatter.damping, least[1]))
         state = replace(fit.solution.state, spread=spread)
         self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
         # A parameter without prior and information stays where it is.
@@ -385,8 +343,7 @@ class ForceProblem:
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
         motions = [_on_track(*each) for each in zip(self.data, effects, motions_of(fit, effects), strict=True)]
-        self.tracks = self.point(state.theta, effects, motions)
-        self.fitted = self.point(state.theta, state.trial_effects, motions_of(fit, state.trial_effects))
+        self.start = self.point(state.theta, effects, motions)
 
     def inflation(self, chi2: float) -> float:
         """Variance in units of the noise's where a model leaves this χ². What it leaves beyond the noise is correlated
@@ -401,34 +358,24 @@ class ForceProblem:
     ) -> ForcePoint:
         """The terms of the model, and of a force beside it, along motions."""
         step = 1e-3  # Step of finite differences, in the fit's scaling of parameters (derived)
-        predictor = self.fit.predictor
-        here, *by_effect = (
-            predictor.jobs(theta, trial_effects + step * unit)
-            for unit in np.eye(N_TRIAL_EFFECTS + 1)[[-1, PRESSURE, DAMPING_DEVIATION], :N_TRIAL_EFFECTS]
-        )
-        by_parameter = [predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)]
+        predictor, effects = self.fit.predictor, np.eye(N_TRIAL_EFFECTS)[[PRESSURE, DAMPING_DEVIATION]]
+        here = predictor.jobs(theta, trial_effects)
+        by_effect = [predictor.jobs(theta, trial_effects + step * unit) for unit in effects]
+        # The last stands for a parameter that a trial does not have, whose place is −1.
+        by_parameter = [*(predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)), here]
         moved, derivatives = [], []
-        for i, motion in enumerate(motions):
-            motion = with_terms(self._with_job(motion, here[i]), push)
-            affected = (predictor.has_pressure_deviation[i], predictor.has_damping_deviation[i])
-            jobs = [each[i] if acts else None for each, acts in zip(by_effect, affected, strict=True)]
-            jobs += [by_parameter[k][i] if k >= 0 else None for k in predictor.layout.index[i]]
-            _, before = _accelerated(motion, push)
-            columns = [
-                np.zeros_like(before)
-                if job is None
-                else (_accelerated(self._with_job(motion, job), push)[1] - before) / step
-                for job in jobs
-            ]
-            moved.append(motion)
-            derivatives.append(np.column_stack(columns))
+        for i, (motion, index) in enumerate(zip(motions, predictor.layout.index, strict=True)):
+            moved.append(with_terms(self._with_job(motion, here[i]), push))
+            before = _accelerated(moved[i], push)[1]
+            jobs = [jobs[i] for jobs in (*by_effect, *(by_parameter[k] for k in index))]
+            after = [_accelerated(self._with_job(motion, job), push)[1] for job in jobs]
+            derivatives.append((np.column_stack(after) - before[:, None]) / step)
         return ForcePoint(theta, trial_effects, moved, derivatives)
 
     def _with_job(self, motion: FittedMotion, job: Jobs) -> FittedMotion:
         """The same motion, its model and trial with the parameters of a job."""
-        values = dict(zip(motion.model.parameter_names, job.row.tolist(), strict=True))
-        trial = _trial_of_job(self.data[int(job.trial)].trial, job)
-        return replace(motion, model=motion.model.with_values(values), trial=trial)
+        model, trial = _of_job(motion.model, self.data[int(job.trial)].trial, job)
+        return replace(motion, model=model, trial=trial)
 
 
 class ForceEquations:
@@ -525,9 +472,10 @@ class ForceEquations:
         change = coefficients - self.coefficients
         return self.chi2 - 2 * float(self.score @ change) + float(change @ self.information @ change)
 
-    def moved(self, coefficients: Floats) -> tuple[Floats, Floats, list[FittedMotion]]:
-        """Parameters, trial effects and motions with other coefficients, to first order; releases move by at most two
-        frames, and parameters stay inside their bounds.
+    def moved(self, coefficients: Floats) -> ForcePoint:
+        """The point with other coefficients, to first order: a Gauss–Newton step of all unknowns and motions together
+        (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010). Releases move by at most two frames, and
+        parameters stay inside their bounds.
         """
         point, prior = self.point, self.problem.prior
         change = coefficients - self.coefficients
@@ -541,29 +489,8 @@ class ForceEquations:
         pushes = [columns @ sizes for columns, sizes in zip(self.accelerations, by_all, strict=True)]
         dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
         motions = [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
-        return theta, point.trial_effects + effects, motions
-
-
-def settled(equations: ForceEquations, estimate: Callable[[ForceEquations], Floats]) -> tuple[float, ForcePoint]:
-    """χ² and motions under a force to which they respond in full: Gauss–Newton steps of all unknowns and motions
-    together (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010), with new estimates of the coefficients.
-    """
-    problem, unit_push, best = equations.problem, equations.unit_push, (math.inf, equations.point)
-    try:
-        with np.errstate(all="raise", under="ignore"):
-            # 8: most steps (chosen)
-            for _ in range(8):
-                coefficients = estimate(equations)
-                push = partial(lambda of_all, motion: unit_push(motion) @ of_all, coefficients)
-                point = problem.point(*equations.moved(coefficients), push)
-                equations = ForceEquations(problem, point, unit_push, coefficients)
-                # 1e-3: relative fall of χ² below which the search ends (chosen)
-                if not equations.cost < (1 - 1e-3) * best[0]:
-                    break
-                best = equations.cost, point
-    except (FloatingPointError, np.linalg.LinAlgError):
-        pass  # The step led where nothing can be computed: the point before it stands.
-    return best
+        force = partial(lambda of_all, motion: self.unit_push(motion) @ of_all, coefficients)
+        return self.problem.point(theta, point.trial_effects + effects, motions, force)
 
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:

@@ -1,4 +1,8 @@
-"""Simple laws that a missing force may follow, each with its description in words.
+"""Simple laws that a missing force may follow, each a row of `force_laws.csv` beside this file.
+
+A row holds the size (name, symbol and unit), the law as code of an effect file and as a formula, the kinds that it is
+also tried multiplied by, and its shape parameters (name, symbol, unit), each with the values that are tried, as parts
+of the `largest` growth, speed or time. All of these are chosen. Values beyond 0 are spaced by ratios.
 
 Every law is scaled to a peak of 1 along the fitted motions, so that its amplitude is the largest force, N. A periodic
 law has two amplitudes, of a sine and a cosine. Laws with a position or a scale come in a grid of them.
@@ -6,39 +10,32 @@ law has two amplitudes, of a sine and a cosine. Laws with a position or a scale 
 
 from __future__ import annotations
 
+import csv
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from pathlib import Path
 from types import CodeType, SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import FittedMotion
-
-PATCH_CENTRES = 16  # Number of positions of a local force (chosen)
-
-
-EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
 
 
 @dataclass(frozen=True)
 class Law:
-    """One form of force along a motion. `kind` names it; `low` and `high` are the ends of a patch (m of growth),
-    `scale` its period, decay scale or threshold. `factor` is the variable that it is multiplied by: "position",
-    "speed", "pressure" or nothing.
+    """One form of force along a motion: its kind, by its name in `FORMS`, the values of its shape parameters, SI, and
+    the kind that it is multiplied by: "position", "speed", "pressure" or nothing. The phase of a periodic law is free.
     """
 
     kind: str
-    low: float = math.nan
-    high: float = math.nan
-    scale: float = math.nan
+    shapes: tuple[float, ...] = ()
+    factor: str = ""
     reference_area_m2: float = 0.0
     peak: float = 1.0
-    factor: str = ""
 
     @property
     def name(self) -> str:
@@ -53,44 +50,22 @@ class Law:
     @property
     def n_shapes(self) -> int:
         """Number of shape parameters that are searched over."""
-        return {"patch": 2, "inverse_speed": 0}.get(self.kind, int(math.isfinite(self.scale)))
-
-    @property
-    def n_parameters(self) -> int:
-        """Number of parameters; a factor counts as one, because it was chosen among several."""
-        return self.n_amplitudes + self.n_shapes + bool(self.factor)
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """The variables that it depends on: growth, speed, time or pressure; none for a constant."""
-        variables = {FORMS[kind].variable for kind in (self.kind, self.factor) if kind}
-        return tuple(name for name in ("growth", "speed", "time", "pressure") if name in variables)
+        return sum(len(shape.parts) > 1 for shape in FORMS[self.kind].shapes)
 
     @property
     def is_unresolved(self) -> bool:
         """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
         # 1e-3: least width of a local force that is reported (chosen)
-        return self.kind == "patch" and not self.high - max(self.low, 0.0) > 1e-3
-
-    @property
-    def shape_values(self) -> tuple[float, ...]:
-        """Values of the shape parameters of its form, SI; the phase of a periodic law is free."""
-        if self.kind == "patch":
-            return self.low, self.high - self.low
-        return (self.scale, 0.0) if self.kind == "periodic" else (self.scale,) * len(FORMS[self.kind].shapes)
+        return self.kind == "patch" and not sum(self.shapes) - max(self.shapes[0], 0.0) > 1e-3
 
     def unit_force(self, motion: FittedMotion) -> Floats:
         """The force of each unit amplitude along a motion: as it is and, where periodic, a quarter of a period ahead.
         Shape (n_times, n_amplitudes).
         """
         size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
-        phases = [self.shape_values] if self.kind != "periodic" else [(self.scale, 0.0), (self.scale, math.pi / 2)]
+        phases = [self.shapes, (*self.shapes[:1], math.pi / 2)][: self.n_amplitudes]
         force = np.column_stack([FORMS[self.kind].along(motion, shapes) for shapes in phases])
         return size * (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force)
-
-    def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
-        """Describe the law with its size."""
-        return str(remark("law", law=self, amplitude_N=amplitude_N, sigma_N=sigma_N))
 
 
 # States of a motion by their names in an effect file
@@ -100,137 +75,82 @@ STATE = {
 }  # fmt: skip
 
 
+class Shape(NamedTuple):
+    """A shape parameter of a law, and the values that are tried."""
+
+    name: str
+    symbol: str
+    unit: str
+    parts: tuple[float, ...]
+
+
 @dataclass(frozen=True)
 class LawForm:
-    """A kind of law as an effect file holds it: its size (name, symbol, exponents of its unit in N, m, s and Pa), its
-    shape as code and as a formula, and its shape parameters (name, symbol, unit). `variable` is what it depends on,
-    `times` what it is also tried multiplied by.
-    """
+    """A kind of law: a row of `force_laws.csv`."""
 
-    variable: str
-    size: tuple[str, str, tuple[int, int, int, int]]
+    size: tuple[str, str, str]
     code: str
+    compiled: CodeType
     formula: str
-    shapes: tuple[tuple[str, str, str], ...] = ()
-    times: tuple[str, ...] = ()
-
-    @cached_property
-    def _compiled(self) -> CodeType:
-        return compile(self.code, "law", "eval")
+    times: tuple[str, ...]
+    largest: str
+    shapes: tuple[Shape, ...]
 
     def along(self, motion: FittedMotion, shapes: Sequence[float] = ()) -> Floats:
         """The shape along a motion, as its code says, shape (n_times,)."""
         state = SimpleNamespace(**{name: getattr(motion, attribute) for name, attribute in STATE.items()})
-        known = dict(zip((name for name, _, _ in self.shapes), shapes, strict=True))
-        return np.asarray(eval(self._compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
+        known = dict(zip((shape.name for shape in self.shapes), shapes, strict=True))
+        return np.asarray(eval(self.compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
 
 
-_FORCE = ("F", "F", (1, 0, 0, 0))
-_V_0, _V_1 = (("v_0", "v₀", "m/s"),), (("v_1", "v₁", "m/s"),)
-_BY_BOTH, _BY_PRESSURE = ("speed", "pressure"), ("pressure",)
-FORMS = {
-    "constant": LawForm("", _FORCE, "1.0", "F"),
-    "position": LawForm("growth", ("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x", times=_BY_BOTH),
-    "speed": LawForm("speed", ("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE),
-    "speed_squared": LawForm(
-        "speed", ("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure")
-    ),
-    "position_squared": LawForm(
-        "growth", ("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH
-    ),
-    "beyond_a_place": LawForm(
-        "growth", ("k", "k", (1, -1, 0, 0)), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
-        (("y_0", "y₀", "m"),), _BY_BOTH,
-    ),
-    "speed_cubed": LawForm(
-        "speed", ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³"
-    ),
-    "beyond_a_speed": LawForm(
-        "speed", ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", _V_1
-    ),
-    "squared_beyond_a_speed": LawForm(
-        "speed", ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", _V_1
-    ),
-    "pressure": LawForm("pressure", ("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
-    "time": LawForm("time", ("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
-    "inverse_speed": LawForm(
-        "speed", _FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", _V_0, _BY_PRESSURE
-    ),
-    "falling_with_speed": LawForm(
-        "speed", _FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", _V_0, _BY_PRESSURE
-    ),
-    "fading_in_time": LawForm("time", _FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (("t_0", "t₀", "s"),)),
-    "fading_along": LawForm(
-        "growth", _FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (("reach", "ℓ", "m"),), _BY_BOTH
-    ),
-    "patch": LawForm(
-        "growth",
-        _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
-        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
-        f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
-        (("y_1", "y₁", "m"), ("width", "w", "m")),
-    ),
-    "periodic": LawForm(
-        "growth",
-        _FORCE,
-        "np.sin(2.0 * np.pi * s.lead_position / period + phi)",
-        "F sin(2π y/Λ + φ)",
-        (("period", "Λ", "m"), ("phi", "φ", "rad")),
-    ),
-}  # fmt: skip
+def _read_forms() -> dict[str, LawForm]:
+    forms = {}
+    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            described = [each.split(":") for each in row["shapes"].split(";") if each]
+            shapes = tuple(
+                Shape(name, symbol, unit, tuple(map(float, parts.split())))
+                for names, parts in described
+                for name, symbol, unit in [names.split()]
+            )
+            size, code = (row["size"], row["symbol"], row["unit"]), compile(row["code"], row["kind"], "eval")
+            times = tuple(row["times"].split())
+            forms[row["kind"]] = LawForm(size, row["code"], code, row["formula"], times, row["largest"], shapes)
+    return forms
+
+
+FORMS = _read_forms()  # Every kind of law by its name
 
 
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
-    growth_m, speed_m_s, time_s = _visited(motions)
-    plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
-    laws = [Law(kind) for kind in plain]
-    # Positions and speeds above which a force may set in, as parts of the highest (chosen)
-    for part in ((np.arange(8) + 0.5) / 8).tolist():
-        laws.append(Law("beyond_a_place", scale=part * growth_m))
-        laws += [Law(kind, scale=part * speed_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
-    # 0.05: part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
-    laws.append(Law("inverse_speed", scale=0.05 * speed_m_s))
-    # Decay scales as parts of the largest growth, speed or time (chosen)
-    for part in (0.04, 0.1, 0.2, 0.4):
-        scales = {"falling_with_speed": speed_m_s, "fading_in_time": time_s, "fading_along": growth_m}
-        laws += [Law(kind, scale=part * largest) for kind, largest in scales.items()]
-    # Widths of a local force as parts of the growth (chosen)
-    for width, place in itertools.product((0.06, 0.12, 0.2, 0.33), range(PATCH_CENTRES)):
-        laws.append(_patch_at((place + 0.5) / PATCH_CENTRES * growth_m, width * growth_m))
-    # 24 periods, as parts of the growth (chosen)
-    laws += [Law("periodic", scale=period * growth_m) for period in np.geomspace(0.04, 0.6, 24).tolist()]
-    laws += [replace(law, factor=factor) for law in laws for factor in FORMS[law.kind].times]
+    largest = _largest(motions)
+    laws = [
+        Law(kind, tuple(part * largest[form.largest] for part in parts), factor)
+        for kind, form in FORMS.items()
+        for parts in itertools.product(*(shape.parts for shape in form.shapes))
+        for factor in ("", *form.times)
+    ]
     areas = [motion.trial.area_m2 for motion in motions]
     # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
     if max(areas) > 1.02 * min(areas):
         mean_m2 = float(np.mean(areas))
-        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in law.variables]
+        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in (law.kind, law.factor)]
     return _with_unit_peak(laws, motions)
 
 
-def laws_near(law: Law, motions: Sequence[FittedMotion], part: float = 1.0) -> list[Law]:
-    """Laws near another: its position, width, period or scale varied by less than a step of the grid, or by part of
-    that.
-    """
-    if law.kind == "patch":
-        centre, width = (law.low + law.high) / 2, law.high - law.low
-        step = part * _visited(motions)[0] / PATCH_CENTRES
-        near = [law] if law.factor else [replace(law, factor="speed"), replace(law, factor="pressure")]
-        for shift, stretch in itertools.product(np.linspace(-0.75, 0.75, 7), (0.5, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8)):
-            moved = _patch_at(centre + float(shift) * step, stretch**part * width)
-            near.append(replace(law, low=moved.low, high=moved.high))
-    elif law.n_shapes:
-        factors = np.geomspace(0.9, 1.11, 17) if law.kind == "periodic" else np.geomspace(0.5, 2.0, 13)
-        near = [replace(law, scale=law.scale * factor) for factor in (factors**part).tolist()]
-    else:
-        return []
-    return _with_unit_peak(near, motions)
-
-
-def _patch_at(centre: float, width: float) -> Law:
-    return Law("patch", low=centre - width / 2, high=centre + width / 2)
+def laws_near(law: Law, motions: Sequence[FittedMotion], part: float) -> list[Law]:
+    """Laws near another: each shape that is searched over varied by less than this part of a step of the grid."""
+    form, varied = FORMS[law.kind], []
+    for value, shape in zip(law.shapes, form.shapes, strict=True):
+        first, last, steps = shape.parts[0], shape.parts[-1], len(shape.parts) - 1
+        change = part * np.linspace(-0.75, 0.75, 9) / steps if steps else np.zeros(1)
+        if first > 0:
+            values = value * (last / first) ** change
+        else:
+            values = value + _largest(motions)[form.largest] * (last - first) * change
+        varied.append(values.tolist())
+    return _with_unit_peak([replace(law, shapes=shapes) for shapes in itertools.product(*varied)], motions)
 
 
 def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
@@ -253,10 +173,10 @@ def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> lis
     return scaled
 
 
-def _visited(motions: Sequence[FittedMotion]) -> tuple[float, float, float]:
+def _largest(motions: Sequence[FittedMotion]) -> dict[str, float]:
     """The largest growth, m, speed of the tail, m/s, and time, s, among the motions."""
-    return (
-        max(float(motion.lead_position_m[motion.is_visited].max()) for motion in motions),
-        max(float(np.quantile(motion.tail_velocity_m_s[motion.is_visited], 0.98)) for motion in motions),
-        max(float(motion.time_s[motion.is_visited].max()) for motion in motions),
-    )
+    return {
+        "growth": max(float(motion.lead_position_m[motion.is_visited].max()) for motion in motions),
+        "speed": max(float(np.quantile(motion.tail_velocity_m_s[motion.is_visited], 0.98)) for motion in motions),
+        "time": max(float(motion.time_s[motion.is_visited].max()) for motion in motions),
+    }

@@ -32,13 +32,9 @@ from vinetrack.diagnosis.force_inversion import (
     ForceEstimate,
     ForcePoint,
     ForceProblem,
-    settled,
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
-from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,
@@ -67,17 +63,36 @@ ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anyt
 LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
 
 
+# Variables taken as logarithms over most of their range, from 1 to 1 + 3 (chosen): speeds and durations of a campaign
+# span decades, and forces change over fractions of them
+LOGARITHMIC, LOG_RATIO = ("speed", "time"), 3.0
+
+# Splines along a variable, when it is alone and when it is one of two (chosen)
+SPLINES = {"growth": (24, 20), "speed": (16, 8), "time": (16, 8), "pressure": (7, 5)}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A variable of a force, the range that was visited, SI, and the number of splines along it."""
+
+    name: str
+    low: float
+    high: float
+    count: int
+
+    def part(self, at: Floats) -> Floats:
+        """The variable scaled to 0 to 1 over the visited range. Shapes: at (n,) → (n,)."""
+        part = (at - self.low) / (self.high - self.low)
+        if self.name in LOGARITHMIC:
+            part = np.log1p(LOG_RATIO * np.maximum(part, 0.0)) / math.log1p(LOG_RATIO)
+        return np.asarray(part)
+
+
 @dataclass(frozen=True)
 class Domain:
-    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
-    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
-    """
+    """The variables of a force, one or two."""
 
-    variables: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    counts: tuple[int, ...]
-    log_scale: tuple[float, ...]
+    axes: tuple[Axis, ...]
 
     @property
     def name(self) -> str:
@@ -85,21 +100,19 @@ class Domain:
         return "+".join(self.variables)
 
     @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables."""
+        return tuple(axis.name for axis in self.axes)
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of splines along the variables."""
+        return tuple(axis.count for axis in self.axes)
+
+    @property
     def start_axis(self) -> int:
         """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
         return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
-
-    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
-        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
-        """
-        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
-        return [
-            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
-            if math.isfinite(log_scale)
-            else (at - low) / (high - low)
-            for at, low, high, log_scale in limits
-        ]
 
     def values_along(self, motion: FittedMotion) -> list[Floats]:
         """The variables along a motion, SI, each of shape (n_times,)."""
@@ -107,7 +120,7 @@ class Domain:
 
     def basis(self, values: Sequence[Floats]) -> Floats:
         """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, n_splines)."""
-        first, *others = [splines(at, count) for at, count in zip(self.normalised(values), self.counts, strict=True)]
+        first, *others = [splines(axis.part(at), axis.count) for axis, at in zip(self.axes, values, strict=True)]
         for other in others:
             first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
         return first
@@ -119,17 +132,14 @@ class Domain:
     @property
     def hypotheses(self) -> list[tuple[str, tuple[float, ...]]]:
         """What the force may be where growth begins, with every combination of length scales."""
-        starts = list(LOG_ODDS) if len(self.variables) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
-        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.variables))
+        starts = list(LOG_ODDS) if len(self.axes) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
+        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.axes))
         return list(itertools.product(starts if self.start_axis >= 0 else [FREE_AT_START], lengths))
 
     def modes(self, at_start: str, lengths: Sequence[float]) -> Floats:
         """Square root of the covariance of the coefficients at unit amplitude, shape (n_splines, n_modes)."""
         start = self.start_axis
-        roots = [
-            root_of_covariance(count, length, k == start)
-            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
-        ]
+        roots = [root_of_covariance(*each, k == start) for k, each in enumerate(zip(self.counts, lengths, strict=True))]
         modes = [product_of_modes(roots)]
         if at_start == CONSTANT_AT_START:
             modes.append(np.ones((math.prod(self.counts), 1)))
@@ -142,8 +152,7 @@ class Domain:
 
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     """Every variable alone, then every pair, over the ranges that the motions visit."""
-    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
-    ranges: dict[str, tuple[float, float, float]] = {}
+    ranges: dict[str, tuple[float, float]] = {}
     for name, attribute in VARIABLES.items():
         by_trial = [np.asarray(getattr(motion, attribute))[motion.is_visited] for motion in motions]
         # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
@@ -151,20 +160,55 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
         # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
         if high - low > 0.02 * abs(high):
-            if name == "pressure":
-                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
-            typical = float(np.median([np.median(values) for values in by_trial]))
-            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
-            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
-    # Splines along a variable, when it is alone and when it is one of two (chosen)
-    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-    domains = []
-    for names in (*((name,) for name in ranges), *itertools.combinations(ranges, 2)):
-        counts = tuple((alone if len(names) == 1 else in_pair)[name] for name in names)
-        lows, highs, scales = zip(*(ranges[name] for name in names), strict=True)
-        domains.append(Domain(names, lows, highs, counts, scales))
-    return domains
+            # 0.03: part by which the range of pressures is extended at both ends (chosen)
+            ranges[name] = (0.97 * low, 1.03 * high) if name == "pressure" else (low, high)
+    choices = [*((name,) for name in ranges), *itertools.combinations(ranges, 2)]
+    return [
+        Domain(tuple(Axis(name, *ranges[name], SPLINES[name][len(names) - 1]) for name in names)) for names in choices
+    ]
+
+
+@dataclass(frozen=True)
+class SmoothForce:
+    """A force over some variables: the posterior of its coefficients, N, and the motions of the trials under it."""
+
+    domain: Domain
+    found: Posterior
+    motions: Sequence[FittedMotion]
+
+    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.domain.basis(values)
+        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The force on a grid of its variables (condition blank), with the number of trials that visited each point,
+        and along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
+        """
+        import pandas as pd
+
+        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+        axes, names = self.domain.axes, [VARIABLES[name] for name in self.domain.variables]
+        ends = [np.linspace(axis.low, axis.high, plot_points[len(axes) - 1]) for axis in axes]
+        grid = [values.ravel() for values in np.meshgrid(*ends, indexing="ij")]
+        trials = np.zeros(grid[0].size, dtype=int)
+        parts = {"": dict(zip(names, grid, strict=True))}
+        for motion in self.motions:
+            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+            for axis, at, course in zip(axes, grid, self.domain.values_along(motion), strict=True):
+                near &= np.abs(axis.part(at)[:, None] - axis.part(course)) < visited_distance
+            trials += near.any(axis=1)
+            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+            along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
+            parts.setdefault(motion.trial.condition, along)
+        tables = []
+        for condition, values in parts.items():
+            force_N, sigma_N = self.force([values[name] for name in names])
+            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
+            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+            tables.append(pd.DataFrame(columns | {"condition": condition}))
+        return pd.concat(tables, ignore_index=True)
 
 
 # ------------------------------------------------------------------------------
@@ -181,26 +225,16 @@ LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is es
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A force over some variables. `equations` are those of its coefficients, `best` their least squares without regard
-    to how smooth the force is, `found` their posterior.
-    """
+class Choice(SmoothForce):
+    """A force over some variables, the equations of its coefficients, and their least squares whether smooth or not."""
 
-    domain: Domain
     equations: ForceEquations
     best: ForceEstimate
-    found: Posterior
 
     @property
     def least_chi2(self) -> float:
         """χ² of the best coefficients."""
         return self.equations.chi2 - self.best.delta_chi2
-
-
-def amplitudes_N(motions: Sequence[FittedMotion]) -> Floats:
-    """Amplitudes of forces that are averaged over, N."""
-    drive_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
-    return drive_N * np.geomspace(0.003, 0.3, 9)  # Parts of the largest drive (chosen)
 
 
 def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
@@ -209,8 +243,10 @@ def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
     equations = [ForceEquations(problem, point, domain.unit_push) for domain in domains]
     best = [each.estimate() for each in equations]
     inflation = problem.inflation(min(e.chi2 - b.delta_chi2 for e, b in zip(equations, best, strict=True)))
-    found = [coefficients_of(*each, inflation) for each in zip(domains, equations, strict=True)]
-    return [Choice(*each) for each in zip(domains, equations, best, found, strict=True)]
+    return [
+        Choice(domain, coefficients_of(domain, each, inflation), point.motions, each, estimate)
+        for domain, each, estimate in zip(domains, equations, best, strict=True)
+    ]
 
 
 def _least_chi2(choices: Sequence[Choice]) -> float:
@@ -219,11 +255,13 @@ def _least_chi2(choices: Sequence[Choice]) -> float:
 
 def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float) -> Posterior:
     """The posterior of the coefficients over a domain, their noise variance inflated."""
+    drives_N = (np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2 / 2 for motion in equations.point.motions)
+    amplitudes_N = max(float(np.max(drive_N)) for drive_N in drives_N) * np.geomspace(0.003, 0.3, 9)  # (chosen)
     return posterior(
         equations.information / inflation,
         (equations.score + equations.information @ equations.coefficients) / inflation,
         [domain.modes(*each) for each in domain.hypotheses],
-        amplitudes_N(equations.point.motions),
+        amplitudes_N,
         [LOG_ODDS[at_start] for at_start, _ in domain.hypotheses],
     )
 
@@ -241,57 +279,19 @@ def variable_weights(log_evidence: Mapping[str, float], unit: float = 1.0) -> di
 
 
 @dataclass(frozen=True)
-class LearnedForce:
-    """The missing force over the variables that it most likely depends on: the posterior of its coefficients, N, and
-    the most likely of the hypotheses that this averages over. `motions` are those of the trials at the solution.
-    """
+class LearnedForce(SmoothForce):
+    """The missing force over the variables that it most likely depends on."""
 
-    domain: Domain
-    found: Posterior
-    at_start: str
-    length_scales: tuple[float, ...]
-    motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
     not_excluded: tuple[str, ...]
     log_bayes_factor: float
     explained: float
     is_repeated: bool
 
-    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
-        basis = self.domain.basis(values)
-        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
-        import pandas as pd
-
-        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-        domain = self.domain
-        axes = [
-            np.linspace(low, high, plot_points[len(domain.variables) - 1])
-            for low, high in zip(domain.low, domain.high, strict=True)
-        ]
-        grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
-        trials = np.zeros(grid[0].size, dtype=int)
-        along: dict[str, list[Floats]] = {}
-        for motion in self.motions:
-            visited = domain.values_along(motion)
-            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
-            for at, course in zip(domain.normalised(grid), domain.normalised(visited), strict=True):
-                near &= np.abs(at[:, None] - course) < visited_distance
-            trials += near.any(axis=1)
-            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
-            along.setdefault(motion.trial.condition, [values[points] for values in visited])
-        parts = []
-        for condition, values in {"": grid, **along}.items():
-            force_N, sigma_N = self.force(values)
-            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan)
-            columns |= {VARIABLES[name]: at for name, at in zip(domain.variables, values, strict=True)}
-            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
-            parts.append(pd.DataFrame(columns | {"condition": condition}))
-        return pd.concat(parts, ignore_index=True)
+    @property
+    def likeliest(self) -> tuple[str, tuple[float, ...]]:
+        """What the force is where growth begins, and its length scales: the most likely of those averaged over."""
+        return self.domain.hypotheses[self.found.hypothesis]
 
     @property
     def visited(self) -> pd.DataFrame:
@@ -307,7 +307,7 @@ class LearnedForce:
             name=self.domain.name,
             weights=self.weights,
             alternatives=self.not_excluded,
-            begins=self.at_start if self.domain.start_axis >= 0 else "",
+            begins=self.likeliest[0] if self.domain.start_axis >= 0 else "",
             range_N=(float(force_N.min()), float(force_N.max())),
             sigma_N=float(self.visited["sigma_N"].median()),
             explained=self.explained,
@@ -317,25 +317,26 @@ class LearnedForce:
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
+        at_start, length_scales = self.likeliest
         return {
             "variables": list(self.domain.variables),
             "weights": dict(self.weights),
             "not_excluded": list(self.not_excluded),
-            "length_scales": dict(zip(self.domain.variables, self.length_scales, strict=True)),
+            "length_scales": dict(zip(self.domain.variables, length_scales, strict=True)),
             "amplitude_N": self.found.amplitude,
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": self.at_start,
+            "begins": at_start,
             "sentence": str(self.sentence),
         }
 
 
-def learned_force(
-    problem: ForceProblem, choices: Sequence[Choice], misfit: float, log_bayes_factors: Mapping[str, float]
-) -> LearnedForce | None:
+def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Sequence[Choice]) -> LearnedForce | None:
     """The missing force over the variables of the highest marginal likelihood, where it explains the misfit: χ² beyond
-    the number of points, as the evidence against no force, seen from the tracks.
+    the number of points, as the evidence against no force, as first seen from the tracks.
     """
+    misfit = first[0].equations.chi2 - problem.n_points
+    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in first}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
     if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
         return None
@@ -351,23 +352,13 @@ def learned_force(
     # Besides the best, those with enough weight, and those of no more variables whose χ² is hardly larger, without
     # regard to how smooth they are. 0.05: weight from which a choice is reported with the best (chosen)
     threshold = best.least_chi2 + inflation * unit * ANSWER_SET_DELTA_CHI2
-    others = [
-        other.domain.name
-        for other in choices
-        if other is not best
-        and (
-            weights[other.domain.name] >= 0.05
-            or (len(other.domain.variables) <= len(domain.variables) and other.least_chi2 < threshold)
-        )
-    ]
-    others.sort(key=lambda name: -weights[name])
-    at_start, lengths = domain.hypotheses[best.found.hypothesis]
+    as_good = {choice.domain.name for choice in choices if choice.least_chi2 < threshold}
+    as_good -= {name for name in as_good if "+" in name and len(domain.axes) == 1}
+    others = [name for name in weights if name != domain.name and (weights[name] >= 0.05 or name in as_good)]
     return LearnedForce(
         domain=domain,
         found=best.found,
-        at_start=at_start,
-        length_scales=lengths,
-        motions=equations.point.motions,
+        motions=best.motions,
         weights=weights,
         not_excluded=tuple(others),
         log_bayes_factor=log_bayes_factors[domain.name],
@@ -378,16 +369,25 @@ def learned_force(
 
 def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
     """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
-    less: far from the solution, two are often the more likely for errors of the linear equations alone.
+    less: far from the solution, two are often the more likely for errors of the linear equations alone. Motions respond
+    in full, by steps with new estimates of the coefficients.
     """
-    inflation = problem.inflation(_least_chi2(choices))
+    inflation, found = problem.inflation(_least_chi2(choices)), [(math.inf, choices[0].equations.point)]
     by_evidence = sorted(choices, key=lambda choice: -choice.found.log_evidence)
-    likely = {len(choice.domain.variables): choice for choice in reversed(by_evidence)}
-
-    def settle(choice: Choice) -> tuple[float, ForcePoint]:
-        return settled(choice.equations, lambda each: coefficients_of(choice.domain, each, inflation).mean)
-
-    return min((settle(choice) for choice in likely.values()), key=lambda found: found[0])[1]
+    for choice in {len(choice.domain.axes): choice for choice in reversed(by_evidence)}.values():
+        equations, cost = choice.equations, math.inf
+        # A step may lead where nothing can be computed: the point before it stands.
+        with suppress(FloatingPointError, np.linalg.LinAlgError):
+            # 8, 1e-3: most steps, and relative fall of χ² below which the search ends (chosen)
+            for _ in range(8):
+                coefficients = coefficients_of(choice.domain, equations, inflation).mean
+                point = equations.moved(coefficients)
+                equations = ForceEquations(problem, point, choice.domain.unit_push, coefficients)
+                if not equations.cost < (1 - 1e-3) * cost:
+                    break
+                cost = equations.cost
+                found.append((cost, point))
+    return min(found, key=lambda each: each[0])[1]
 
 
 # ------------------------------------------------------------------------------
@@ -414,7 +414,15 @@ class RankedLaw:
     @property
     def words(self) -> str:
         """Description of the law with its amplitude."""
-        return self.law.words(self.estimate.amplitude.tolist(), self.estimate.sigma)
+        return str(remark("law", law=self.law, amplitude_N=self.estimate.amplitude, sigma_N=self.estimate.sigma))
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """As a row of `laws` in `diagnosis.json`."""
+        amplitude, of_law = self.estimate.amplitude, {"law": self.law.name, "words": self.words}
+        size_N = float(amplitude[0]) if amplitude.size == 1 else math.hypot(*amplitude)
+        sizes = {"explained": self.explained, "amplitude_N": size_N, "sigma_N": self.estimate.sigma}
+        return of_law | sizes | {"delta_chi2": self.estimate.delta_chi2, "bic": self.bic}
 
 
 def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:
@@ -424,58 +432,39 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
     `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
     n_independent = 10.0 * len(problem.data)  # Independent residuals where a model leaves more than noise (chosen)
-    largest_N = _largest_N(point.motions)
-
-    def ranked(estimated: Sequence[tuple[Law, ForceEstimate]]) -> list[RankedLaw]:
-        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
-        laws = [
-            RankedLaw(
-                law,
-                estimate,
-                (largest - estimate.delta_chi2) / noise + law.n_parameters * math.log(n_independent),
-                largest_N=largest_N,
-            )
-            for law, estimate in estimated
-        ]
-        best: dict[str, RankedLaw] = {}
-        for each in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
-            best.setdefault(each.law.name, each)
-        return list(best.values())
-
-    estimated = _estimates(problem, point, laws_on_grid(point.motions))
-    for finer, count in ((1.0, None), (0.25, 1)):
-        best = ranked(estimated)[:count]
-        near = [law for each in best for law in laws_near(each.law, point.motions, finer)]
-        estimated += _estimates(problem, point, near)
-    return ranked(estimated)
-
-
-def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) -> list[tuple[Law, ForceEstimate]]:
-    """Each law estimated alone."""
-    if not laws:
-        return []
-    equations = ForceEquations(problem, point, lambda motion: np.hstack([law.unit_force(motion) for law in laws]))
-    ends = np.cumsum([law.n_amplitudes for law in laws]).tolist()
-    places = [slice(end - law.n_amplitudes, end) for law, end in zip(laws, ends, strict=True)]
-    return [(law, equations.estimate(place)) for law, place in zip(laws, places, strict=True)]
-
-
-def _largest_N(motions: Sequence[FittedMotion]) -> float:
-    """The largest force that is reported: ten times drive, weight and inertia of the trials at their largest."""
-    sizes = []
-    for motion in motions:
+    largest_N = 0.0
+    for motion in point.motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
-        sizes.append(float(np.max(drive_N + body_N)))
-    return 10.0 * max(sizes)
+        # 10.0: largest force that is reported, in parts of drive, weight and inertia at their largest (chosen)
+        largest_N = max(largest_N, 10.0 * float(np.max(drive_N + body_N)))
+
+    def unit_forces(motion: FittedMotion) -> Floats:
+        return np.hstack([law.unit_force(motion) for law in laws])
+
+    laws, estimated, best = laws_on_grid(point.motions), list[tuple[Law, ForceEstimate]](), dict[str, RankedLaw]()
+    for near, part in ((None, 1.0), (1, 0.25), (0, 0.0)):
+        equations, end = ForceEquations(problem, point, unit_forces), 0
+        for law in laws:
+            begin, end = end, end + law.n_amplitudes
+            estimated.append((law, equations.estimate(slice(begin, end))))
+        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
+        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
+        ranked = []
+        for law, estimate in estimated:
+            # A factor counts as a parameter, because it was chosen among several.
+            n_parameters = law.n_amplitudes + law.n_shapes + bool(law.factor)
+            bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(n_independent)
+            ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
+        best = {}
+        for each in sorted(ranked, key=lambda law: (not law.is_detected, law.bic)):
+            best.setdefault(each.law.name, each)
+        laws = [law for each in list(best.values())[:near] for law in laws_near(each.law, point.motions, part)]
+    return list(best.values())
 
 
 # ------------------------------------------------------------------------------
 # What is missing.
-
-FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
-LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
@@ -485,9 +474,7 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 @dataclass(frozen=True)
 class MissingForce:
-    """What is missing, as a force on the tail, N. `table`, columns `FORCE_COLUMNS`: the force of every condition
-    (blank: mean over all) against `lead_position_m`, `tail_velocity_m_s`, `time_s` and `pressure_Pa`.
-    """
+    """What is missing, as a force on the tail, N. `table` is that of its most likely variables."""
 
     table: pd.DataFrame
     laws: pd.DataFrame
@@ -506,28 +493,18 @@ class MissingForce:
         }
 
 
-def force_problem(fit: Fit) -> ForceProblem:
-    """What is asked of forces beside a fit, with the scatter of its replicates."""
-    try:
-        return ForceProblem(fit, replicate_scatter(fit, residual_courses(fit)[0]))
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
-
-
 @in_one_blas_thread
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
-    problem = force_problem(fit)
-    choices, learned = list[Choice](), None
+    import pandas as pd
+
+    problem = ForceProblem(fit)
+    first = choices = choices_seen_from(problem, problem.start)
+    learned = None
     with suppress(FloatingPointError, np.linalg.LinAlgError), np.errstate(all="raise", under="ignore"):
-        choices = choices_seen_from(problem, problem.tracks)
-        misfit = choices[0].equations.chi2 - problem.n_points
-        log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in choices}
-        choices = choices_seen_from(problem, _under_best(problem, choices))
-        learned = learned_force(problem, choices, misfit, log_bayes_factors)
-    # Where the misfit is small, smoothed tracks can be further from the truth than the motions of the model.
-    of_model = choices_seen_from(problem, problem.fitted)
-    choices = min(choices or of_model, of_model, key=_least_chi2)
+        choices = choices_seen_from(problem, _under_best(problem, first))
+        learned = learned_force(problem, first, choices)
+    choices = min(first, choices, key=_least_chi2)
     point, chi2 = choices[0].equations.point, choices[0].equations.chi2
     laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
     smooth = {choice.domain.name: choice.best.delta_chi2_beyond_chance for choice in choices}
@@ -538,67 +515,15 @@ def missing_force(fit: Fit) -> MissingForce:
     beyond_noise = chi2 - problem.n_points
     # NaN where the misfit hardly exceeds the noise
     reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
-    drawn = max(choices, key=lambda choice: choice.found.log_evidence) if learned is None else learned
+    drawn = learned or max(choices, key=lambda choice: choice.found.log_evidence)
     return MissingForce(
-        table=_force_table(_curves(drawn.domain, drawn.found, point.motions)),
-        laws=_law_table(laws),
+        table=drawn.table,
+        laws=pd.DataFrame([law.row for law in laws]),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
         detected=tuple(law for law in laws if law.is_detected),
         learned=learned,
     )
-
-
-def _curves(domain: Domain, found: Posterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
-    """The smooth force along the first trial's motion of every condition, without the ends where it is hardly
-    determined. Columns `VARIABLES`, force, error and condition.
-    """
-    import pandas as pd
-
-    curves = []
-    for condition, motion in {motion.trial.condition: motion for motion in reversed(motions)}.items():
-        # 24: points of a curve (chosen)
-        y = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
-        time_s = np.interp(y, motion.lead_position_m, motion.time_s)
-        values = {name: np.interp(time_s, motion.time_s, getattr(motion, name)) for name in VARIABLES.values()}
-        basis = domain.basis([values[VARIABLES[name]] for name in domain.variables])
-        sigma_N = standard_error(basis, found.covariance)
-        curve = pd.DataFrame(values | {"force_N": basis @ found.mean, "sigma_N": sigma_N, "condition": condition})
-        # 2.0: multiple of the median standard error above which a force is not drawn (chosen)
-        curves.append(curve[sigma_N <= 2.0 * np.median(sigma_N)])
-    return pd.concat(curves, ignore_index=True)
-
-
-def _force_table(curves: pd.DataFrame) -> pd.DataFrame:
-    """The force against each variable, by condition and as weighted means over all conditions in ten bins, their errors
-    at least as large as conditions differ.
-    """
-    import pandas as pd
-
-    by_condition, means = [], []
-    for against in VARIABLES.values():
-        points = curves.rename(columns={against: "value"}).assign(against=against)
-        by_condition.append(points)
-        low, high = points["value"].min(), points["value"].max()
-        for _, inside in points.groupby(np.minimum(10 * (points["value"] - low) // max(high - low, 1e-300), 9)):
-            force_N, weight = inside["force_N"], 1 / inside["sigma_N"] ** 2
-            mean, at = (float(np.average(each, weights=weight)) for each in (force_N, inside["value"]))
-            others = inside["condition"].nunique() - 1
-            scatter = math.sqrt(float(np.average((force_N - mean) ** 2, weights=weight)) / others) if others else 0.0
-            means.append((against, at, mean, max(float(weight.sum()) ** -0.5, scatter), ""))
-    columns = list(FORCE_COLUMNS)
-    return pd.concat([*by_condition, pd.DataFrame(means, columns=columns)], ignore_index=True)[columns]
-
-
-def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
-    import pandas as pd
-
-    rows = []
-    for law in laws:
-        amplitude, estimate = law.estimate.amplitude, law.estimate
-        size_N = float(amplitude[0]) if amplitude.size == 1 else float(np.hypot(*amplitude))
-        rows.append((law.law.name, law.words, law.explained, size_N, estimate.sigma, estimate.delta_chi2, law.bic))
-    return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
 
 def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> Remark:

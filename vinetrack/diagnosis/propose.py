@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 import tempfile
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -20,11 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Track
+from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS, STATE
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -36,6 +37,8 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misf
 from vinetrack.diagnosis.missing_force import (
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
+    LOG_RATIO,
+    LOGARITHMIC,
     VARIABLES,
     Domain,
     LearnedForce,
@@ -43,7 +46,7 @@ from vinetrack.diagnosis.missing_force import (
     missing_force,
 )
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
-from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
+from vinetrack.effects import Effect, EffectError, find_effect, load_effect, own_effects, remember
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
@@ -64,9 +67,6 @@ def add(
     """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
     (the ladder of errors, one row for each model).
     """
-    from vinetrack.diagnosis.ladder import ladder
-    from vinetrack.effects import own_effects
-
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(experiment.settings.model, user_effects)
     if name.endswith(".py"):
@@ -110,11 +110,6 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 
 
-def table_name(learned: LearnedForce) -> str:
-    """Name of the effect that holds a learned force, such as `learned_growth_speed`."""
-    return "_".join(["learned", *learned.domain.variables])
-
-
 def table_text(learned: LearnedForce, origin: str = "") -> str:
     """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
     worked example.
@@ -124,12 +119,14 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
     largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
     at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in domain.variables}
     worked_N = float(learned.force([np.array([value]) for value in at.values()])[0][0])
+    table, digits = learned.found.mean.reshape(domain.counts), {"float_kind": "{:.6g}".format}
+    numbers = np.array2string(table, 110, separator=", ", threshold=table.size, formatter=digits)  # type: ignore[arg-type]
     return _source(
         str(remark("learned_file", learned=learned, origin=origin)),
-        constants=_table_lines(learned.found.mean.reshape(domain.counts)),
+        constants=f"TABLE = np.array({numbers})  # N\n\n",
         parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
         arguments={"a": 1.0},
-        body=[*(line for k in range(len(domain.variables)) for line in _axis_code(domain, k)), *_sum_code(domain)],
+        body=_table_code(domain),
         worked_N=worked_N,
         how="the learned force at this state",
         state={_STATE[name]: value for name, value in at.items()},
@@ -138,7 +135,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
 
 def _source(
     docstring: str,
-    constants: Sequence[str],
+    constants: str,
     parameters: Sequence[str],
     arguments: Mapping[str, float],
     body: Sequence[str],
@@ -147,84 +144,65 @@ def _source(
     state: Mapping[str, float],
 ) -> str:
     """Source of an effect file with a tail force: the lines of its parts, and a worked example."""
-    parts = [
-        f'"""{docstring}"""\n',
-        "import numpy as np\n",
-        "from vinetrack.effects import Parameter, Worked\n",
-        *constants,
-        "PARAMETERS = (",
-        *(f"    {parameter}," for parameter in parameters),
-        ")\n\n",
-        f"def tail_force(s, rig, {', '.join(arguments)}):",
-        *(f"    {line}" for line in body),
-        "\n",
-        "WORKED = (",
-        "    Worked(",
-        '        "tail_force",',
-        f"        {worked_N:.8g},",
-        f'        "{how}",',
-        f"        state={state!r},",
-        f"        parameters={arguments!r},",
-        "    ),",
-        ")",
-    ]
-    return "\n".join(parts) + "\n"
+    lines = {name: "\n    ".join(part) for name, part in (("parameters", parameters), ("body", body))}
+    return f'''"""{docstring}"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter, Worked
+
+{constants}PARAMETERS = (
+    {lines["parameters"]}
+)
+
+
+def tail_force(s, rig, {", ".join(arguments)}):
+    {lines["body"]}
+
+
+WORKED = (
+    Worked(
+        "tail_force",
+        {worked_N:.8g},
+        "{how}",
+        state={state!r},
+        parameters={arguments!r},
+    ),
+)
+'''
 
 
 def _parameter(names: Sequence[str], value: str, bounds: Sequence[float], plausible: Sequence[float], more: str) -> str:
     """The line of a parameter of an effect file, of this name, symbol and unit."""
     quoted = ", ".join(f'"{name}"' for name in names)
     limits = ("({:.6g}, {:.6g})".format(*sorted(pair)) for pair in (bounds, plausible))
-    return "Parameter({}, {}, bounds={}, plausible={}, {})".format(quoted, value, *limits, more)
+    return "Parameter({}, {}, bounds={}, plausible={}, {}),".format(quoted, value, *limits, more)
 
 
-def _sum_code(domain: Domain) -> list[str]:
-    """Lines of code that sum the nonzero splines along one axis, or along two."""
-    if len(domain.variables) == 1:
-        return ["return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])"]
-    rows = [
-        f"r{k} = " + " + ".join(f"g{m} * TABLE[i + {k}, j + {m}]" for m in range(4)).replace(" + 0", "")
-        for k in range(4)
-    ]
-    return [*rows, "return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
-
-
-def _axis_code(domain: Domain, k: int) -> list[str]:
-    """Lines of code that find the interval of the table in which a state lies, and the four nonzero splines there."""
-    low, high, log_scale, steps = domain.low[k], domain.high[k], domain.log_scale[k], domain.counts[k] - 3
-    at, step, weight = "uv"[k], "ij"[k], "fg"[k]
-    state = f"s.{_STATE[domain.variables[k]]}"
-    from_low = f"({state} - {_code_number(low)})" if low else state
-    position = f"np.minimum(np.maximum({from_low} / {_code_number(high - low)}, 0.0), 1.0)"
-    if math.isfinite(log_scale):
-        ratio = (high - low) / log_scale
-        position = f"np.log1p({_code_number(ratio)} * {position}) / {_code_number(math.log1p(ratio))}"
-    return [
-        f"{at} = {steps}.0 * {position}",
-        f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",
-        f"{at} = {at} - {step}",
-        f"{weight}0, {weight}3 = (1.0 - {at}) ** 3 / 6.0, {at}**3 / 6.0",
-        f"{weight}1 = (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0",
-        f"{weight}2 = 1.0 - {weight}0 - {weight}1 - {weight}3",
-    ]
-
-
-def _code_number(value: float) -> str:
-    return repr(float(f"{value:.12g}"))
-
-
-def _table_lines(table: Floats) -> list[str]:
-    """The table as lines of code: a tuple of numbers, or a tuple of rows."""
-    table_digits = 6  # Significant digits of a coefficient in the file (chosen)
-    if table.ndim == 1:
-        numbers = ", ".join(f"{value:.{table_digits}g}" for value in table.tolist())
-        return [
-            "TABLE = np.array((  # N",
-            *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
-            "))\n",
+def _table_code(domain: Domain) -> list[str]:
+    """Lines of code that find the interval of the table in which a state lies, and sum the splines that are nonzero."""
+    lines, loops, splines, places = [], [], "", []
+    for depth, (axis, at, place, k) in enumerate(zip(domain.axes, "uv", "ij", "km", strict=False)):
+        low, width = (repr(float(f"{value:.12g}")) for value in (axis.low, axis.high - axis.low))
+        part = f"np.minimum(np.maximum((s.{_STATE[axis.name]} - {low}) / {width}, 0.0), 1.0)"
+        if axis.name in LOGARITHMIC:
+            part = f"np.log1p({LOG_RATIO} * {part}) / np.log1p({LOG_RATIO})"
+        lines += [
+            f"{at} = {axis.count - 3}.0 * {part}",
+            f"{place} = np.maximum(np.minimum(np.int64({at}), {axis.count - 4}), 0)",
+            f"{at} = {at} - {place}",
+            f"of_{at} = (",
+            f"    (1.0 - {at}) ** 3 / 6.0,",
+            f"    (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0,",
+            f"    (1.0 + 3.0 * {at} + 3.0 * {at}**2 - 3.0 * {at}**3) / 6.0,",
+            f"    {at}**3 / 6.0,",
+            ")",
         ]
-    rows = [f"    ({', '.join(f'{value:.{table_digits}g}' for value in row)})," for row in table.tolist()]
-    return ["TABLE = np.array((  # N", *rows, "))\n"]
+        loops.append(f"{'    ' * depth}for {k} in range(4):")
+        splines += f"of_{at}[{k}] * "
+        places.append(f"{place} + {k}")
+    step = f"{'    ' * len(loops)}total = total + {splines}TABLE[{', '.join(places)}]"
+    return [*lines, "total = 0.0", *loops, step, "return a * total"]
 
 
 # ------------------------------------------------------------------------------
@@ -234,25 +212,17 @@ LEAST_SIGMAS = 6.0  # Standard deviations by which a force must improve the fit 
 
 
 @dataclass(frozen=True)
-class ProposedTable:
-    """A learned force that was fitted as an effect; `rms_left_out_m` is with the table learned from all trials."""
-
-    learned: LearnedForce
-    effect: Effect
-    ratio: LikelihoodRatio
-    rms_left_out_m: float
-
-
-@dataclass(frozen=True)
-class ProposedLaw:
-    """A law that was fitted as an effect. `rms_left_out_m` is its error on left-out conditions, m; NaN where the
-    likelihood of others is far higher.
+class Proposed:
+    """A law, or the learned force as a table, that was fitted as an effect. `text` is the source of its file, by where
+    it comes from. `rms_left_out_m` is its error on left-out conditions, m, of a table that was learned from all trials;
+    NaN where the likelihood of others is far higher.
     """
 
-    law: RankedLaw
+    words: str
+    text: Callable[[str], str]
     effect: Effect
     ratio: LikelihoodRatio
-    rms_left_out_m: float
+    rms_left_out_m: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -264,10 +234,10 @@ class Proposal:
 
     before: Fit
     rms_left_out_m: float
-    laws: tuple[ProposedLaw, ...]
-    tied: tuple[ProposedLaw, ...]
-    reason: Remark = field(default_factory=Remark)
-    table: ProposedTable | None = None
+    laws: tuple[Proposed, ...]
+    tied: tuple[Proposed, ...]
+    reason: Remark
+    table: Proposed | None
 
 
 @in_one_blas_thread
@@ -282,52 +252,63 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     # 4: most laws that are fitted in the equation of motion (chosen)
     best = [law for law in detected if law.explained > detected[0].explained - 0.2][:4]
     with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / f"proposed_{law.law.name}.py" for law in best]
-        effects = [_loaded(path, effect_text(law)) for path, law in zip(files, best, strict=True)]
-        if best:
-            before = _with_own_host(before, effects)
-        proposal = _fitted_laws(before, best, effects, report)
-        return replace(proposal, table=_fitted_table(proposal, force.learned, Path(folder), report))
+        before, laws = _fitted(before, best, Path(folder), report)
+        report("errors on left-out conditions")
+        error_m = left_out(before).rms_m
+        laws.sort(key=lambda law: -law.ratio.delta_chi2)
+        laws = [
+            replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
+            if law.ratio.deviance_excess(laws[0].ratio) < OUT_OF_REACH
+            else law
+            for law in laws
+        ]
+        significant = [law for law in laws if law.rms_left_out_m < error_m and _explains(before, law.ratio)]
+        not_excluded = answer_set([law.ratio for law in significant])[0] if significant else []
+        tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
+        reason = Remark() if tied else remark("no_law_predicts_better" if best else "no_law_detected")
+        # The learned force as a table, where it explains what no law does
+        misfit = before.chi2_per_dof - 1
+        remaining = min((law.ratio.fit.chi2_per_dof for law in tied), default=before.chi2_per_dof) - 1
+        # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
+        is_open = misfit >= LEAST_CHI2_PER_POINT - 1 and remaining >= (1 - 0.9) * misfit
+        tried = [force.learned] if force.learned is not None and is_open else []
+        start, tables = _fitted(before, tried, Path(folder), report)
+        tables = [
+            replace(table, rms_left_out_m=left_out(table.ratio.fit).rms_m)
+            for table in tables
+            if _explains(start, table.ratio)
+            and all(law.ratio.deviance_excess(table.ratio) > ANSWER_SET_DELTA_CHI2 for law in tied)
+        ]
+    return Proposal(before, error_m, tuple(laws), tied, reason, next(iter(tables), None))
 
 
-def _with_own_host(fit: Fit, effects: Sequence[Effect]) -> Fit:
-    """The fit, compiled with these effects but without the catalogue, which is not needed here."""
-    return with_host(fit, Model((*fit.model, probe(), *effects)))
-
-
-def _loaded(path: Path, text: str) -> Effect:
-    path.write_text(text, encoding="utf-8")
-    remember(path)
-    return load_effect(path)
-
-
-def _fitted_laws(
-    before: Fit, laws: Sequence[RankedLaw], effects: Sequence[Effect], report: Callable[[str], None]
-) -> Proposal:
-    """The laws in order of their likelihood, with the significant ones that the data do not exclude."""
-    fitted = []
-    for law, effect in zip(laws, effects, strict=True):
-        try:
+def _fitted(
+    before: Fit, forces: Sequence[RankedLaw | LearnedForce], folder: Path, report: Callable[[str], None]
+) -> tuple[Fit, list[Proposed]]:
+    """Forces fitted as effects, and the fit without them, compiled with these effects but without the catalogue, which
+    is not needed here.
+    """
+    if not forces:
+        return before, []
+    files: list[tuple[str, str, Callable[[str], str]]] = []
+    for force in forces:
+        if isinstance(force, RankedLaw):
+            files.append((f"proposed_{force.law.name}", force.words, partial(effect_text, force)))
+        else:
+            name = "_".join(["learned", *force.domain.variables])
+            files.append((name, str(force.sentence), partial(table_text, force)))
+    effects = []
+    for name, _, text in files:
+        path = folder / f"{name}.py"
+        path.write_text(text(""), encoding="utf-8")
+        remember(path)
+        effects.append(load_effect(path))
+    before, found = with_host(before, Model((*before.model, probe(), *effects))), []
+    for (_, words, text), effect in zip(files, effects, strict=True):
+        with suppress(FitError):
             ratio = likelihood_ratio(before, (effect,), fit_with(before, effect, report))
-        except FitError:
-            continue
-        fitted.append(ProposedLaw(law, effect, ratio, math.nan))
-    report("errors on left-out conditions")
-    error_m = left_out(before).rms_m
-    fitted.sort(key=lambda law: -law.ratio.fit.log_likelihood)
-    fitted = [
-        replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
-        if 2 * (fitted[0].ratio.fit.log_likelihood - law.ratio.fit.log_likelihood) < OUT_OF_REACH
-        else law
-        for law in fitted
-    ]
-    significant = [law for law in fitted if law.rms_left_out_m < error_m and _explains(before, law.ratio)]
-    if not significant:
-        reason = remark("no_law_predicts_better" if laws else "no_law_detected")
-        return Proposal(before, error_m, tuple(fitted), (), reason)
-    not_excluded, _ = answer_set([law.ratio for law in significant])
-    tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
-    return Proposal(before, error_m, tuple(fitted), tied)
+            found.append(Proposed(words, text, effect, ratio))
+    return before, found
 
 
 def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
@@ -335,29 +316,6 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
     misfit = before.chi2_per_dof - 1
     reduction = before.chi2_per_dof - ratio.fit.chi2_per_dof
     return ratio.sigma > LEAST_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
-
-
-def _fitted_table(
-    proposal: Proposal, learned: LearnedForce | None, folder: Path, report: Callable[[str], None]
-) -> ProposedTable | None:
-    """The missing force as a smooth function, fitted as a table, where it explains what no law does."""
-    before, laws = proposal.before, [law.ratio.fit for law in proposal.tied]
-    misfit = before.chi2_per_dof - 1
-    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
-    # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
-    if learned is None or misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
-        return None
-    effect = _loaded(folder / f"{table_name(learned)}.py", table_text(learned))
-    try:
-        start = _with_own_host(before, [effect])
-        ratio = likelihood_ratio(start, (effect,), fit_with(start, effect, report))
-    except FitError:
-        return None
-    better = all(2 * (ratio.fit.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
-    if not (better and _explains(start, ratio)):
-        return None
-    report("errors with the table")
-    return ProposedTable(learned, effect, ratio, left_out(ratio.fit).rms_m)
 
 
 # ------------------------------------------------------------------------------
@@ -372,70 +330,41 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
     worked example.
     """
     law, form = detected.law, FORMS[detected.law.kind]
-    times, symbol, unit = "", "", list(form.size[2])
+    times, symbol, unit = "", "", form.size[2]
     if law.factor:
         by = FORMS[law.factor]
         times, symbol = f" * {by.code}", f" {by.formula.split()[-1]}"
-        unit = [a + b for a, b in zip(unit, by.size[2], strict=True)]
-        unit[0] -= 1  # Not N²
-    size, *shapes = (float(f"{value:.6g}") for value in _values(detected))
-    limit = 100 * abs(size)
-    of_size = (*form.size[:2], _unit(unit))
-    parameters = [
-        _parameter(of_size, repr(size), (-limit, limit), (0.0, 10 * size), 'meaning="size of the law"'),
-        *(_shape_parameter(*each) for each in zip(form.shapes, shapes, strict=True)),
-    ]
-    names = [form.size[0], *(name for name, _, _ in form.shapes)]
-    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), []
+        unit += by.size[2].removeprefix("N")
+    amplitude, shapes = detected.estimate.amplitude, law.shapes
+    if law.kind == "periodic":
+        amplitude, shapes = np.array([math.hypot(*amplitude)]), (shapes[0], math.atan2(amplitude[1], amplitude[0]))
+    size, *values = (float(f"{value:.6g}") for value in (amplitude[0] / law.peak, *shapes))
+    names = [form.size[0], *(shape.name for shape in form.shapes)]
+    bounds, plausible = (-100 * abs(size), 100 * abs(size)), (0.0, 10 * size)
+    parameters = [_parameter((*form.size[:2], unit), repr(size), bounds, plausible, 'meaning="size of the law"')]
+    for shape, value in zip(form.shapes, values, strict=True):
+        bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
+        if shape.name in ("phi", "y_1"):
+            half = math.pi if shape.name == "phi" else max(abs(value), 0.01)
+            bounds, plausible = (value - 2 * half, value + 2 * half), (value - half, value + half)
+        more = f'tried=({value!r},), meaning="its shape"'
+        parameters.append(_parameter(shape[:3], f"{value!r}, zero={value!r}", bounds, plausible, more))
+    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), ""
     if law.reference_area_m2:
         times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
         state["area"] = law.reference_area_m2
-        constants = [f"AREA = {law.reference_area_m2:.6g}  # m²\n"]
-    worked_N = _force_N(detected)
+        constants = f"AREA = {law.reference_area_m2:.6g}  # m²\n\n"
+    # From the law itself: it checks the formula of the file
+    along = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
+    there = SimpleNamespace(**along, trial=SimpleNamespace(area_m2=law.reference_area_m2))
+    worked_N = float((law.unit_force(there) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
     return _source(
         str(remark("law_file", law=detected.words, formula=formula, origin=origin)),
         constants=constants,
         parameters=parameters,
-        arguments=dict(zip(names, (size, *shapes), strict=True)),
+        arguments=dict(zip(names, (size, *values), strict=True)),
         body=[f"return {names[0]} * ({form.code}){times}"],
         worked_N=worked_N,
         how=f"the fitted law at this state: {size:.6g} × {worked_N / size:.6g}",
         state=state,
-    )
-
-
-def _values(detected: RankedLaw) -> tuple[float, ...]:
-    """Size and shape parameters of a law as its effect holds them, SI."""
-    law, amplitude = detected.law, detected.estimate.amplitude
-    if law.kind == "periodic":
-        return math.hypot(*amplitude), law.scale, math.atan2(amplitude[1], amplitude[0])
-    return amplitude[0] / law.peak, *law.shape_values
-
-
-def _force_N(detected: RankedLaw) -> float:
-    """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
-    state = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
-    motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
-    return float((detected.law.unit_force(motion) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
-
-
-def _unit(powers: Sequence[int]) -> str:
-    """A unit by its exponents of N, m, s and Pa."""
-    above: list[str] = []
-    below: list[str] = []
-    for name, power in zip(("N", "m", "s", "Pa"), powers, strict=True):
-        if power:
-            (above if power > 0 else below).append(name + {1: "", 2: "²", 3: "³", 4: "⁴"}[abs(power)])
-    denominator = "·".join(below)
-    return "·".join(above) + (f"/({denominator})" if len(below) > 1 else f"/{denominator}" if below else "")
-
-
-def _shape_parameter(names: tuple[str, str, str], value: float) -> str:
-    if names[0] in ("phi", "y_1"):
-        half_range = math.pi if names[0] == "phi" else max(abs(value), 0.01)
-        bounds, plausible = (value - 2 * half_range, value + 2 * half_range), (value - half_range, value + half_range)
-    else:
-        bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
-    return _parameter(
-        names, f"{value!r}, zero={value!r}", bounds, plausible, f'tried=({value!r},), meaning="its shape"'
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import plot
-from vinetrack.diagnosis.power import Power
+from vinetrack.diagnosis.power import Power, StoredRemark
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
 if TYPE_CHECKING:
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.locate import Failure
+
+    Table = pd.DataFrame
+else:
+    Table = Failure = Any  # Records do not look into what no file holds
 
 
 # ------------------------------------------------------------------------------
@@ -124,9 +128,7 @@ class Candidate(JsonRecord):
     numbers: tuple[Number, ...] = ()
     plausible: bool = True
     in_answer_set: bool = False
-    reason: Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)] = field(
-        default_factory=Remark
-    )
+    reason: Annotated[StoredRemark, Field(alias="reason_code")] = field(default_factory=Remark)
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: OrNaN = math.nan
@@ -139,24 +141,23 @@ class Candidate(JsonRecord):
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
-        entry = super().to_json()
-        return {**entry, "reason": str(self.reason), "reason_code": entry["reason"]}
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
-        """Read an entry of `ranking`; absent keys take their defaults."""
-        return super().from_json({**entry, "reason": entry.get("reason_code")})
+        return {**super().to_json(), "reason": str(self.reason)}
 
 
-StoredCandidate = Annotated[Candidate, BeforeValidator(Candidate.from_json), PlainSerializer(Candidate.to_json)]
+StoredCandidate = Annotated[Candidate, PlainSerializer(Candidate.to_json)]
+
+
+@dataclass(frozen=True)
+class Cosines(JsonRecord):
+    """Correlations of the candidates' scores, with the fitted parameters projected off: a matrix in this order."""
+
+    effects: tuple[str, ...] = ()
+    matrix: Sequence[Sequence[OrNaN]] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Round(JsonRecord):
-    """One model and its tests against all candidates. `ranking` has the best candidate first, those not testable last.
-    `cosines` are the correlations of the candidates' scores, with the fitted parameters projected off: names, and a
-    matrix in their order.
-    """
+    """One model and its tests against all candidates. `ranking` has the best first, those not testable last."""
 
     model: tuple[str, ...] = ()
     verdict: str
@@ -165,47 +166,45 @@ class Round(JsonRecord):
     partial: tuple[StoredCandidate, ...] = ()
     explanation: str = ""
     ranking: tuple[StoredCandidate, ...] = ()
-    cosine_names: Annotated[tuple[str, ...], Field(alias="effects")] = ()
-    cosines: Annotated[Sequence[Sequence[OrNaN]], Field(alias="matrix")] = ()
+    cosines: Cosines = Cosines()
     fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None
     fits: Annotated[Mapping[str, InstanceOf[Fit]], Field(exclude=True)] = field(default_factory=dict)
     partial_fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """As an entry of `rounds`."""
-        entry = super().to_json()
-        cosines = {name: entry.pop(name) for name in ("effects", "matrix")}
-        return {**entry, "cosines": cosines}
 
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Round:
-        """Read an entry of `rounds`, which holds no fits."""
-        return super().from_json({**entry, **(entry.get("cosines") or {})})
+StoredPower = Annotated[Power, BeforeValidator(Power.from_json), PlainSerializer(Power.to_json)]
+
+# A file holds the sentences of remarks
+Sentences = Annotated[Sequence[Any], PlainSerializer(lambda lines: [str(line) for line in lines])]
+
+
+def _told(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: str(value) if isinstance(value, Remark) else value for key, value in row.items()} for row in rows]
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis:
+class Diagnosis(JsonRecord):
     """The result of a diagnosis. Printed, it is the text on the terminal. `effects` are those added, in order; `fits`
     the initial model and every enlarged one.
     """
 
-    rounds: tuple[Round, ...]
-    effects: tuple[str, ...]
-    explanation: str
-    fits: tuple[Fit, ...] = ()
-    ladder: pd.DataFrame | None = None
-    drift: Sequence[Mapping[str, Any]] = ()
-    where: Sequence[Remark | str] = ()  # A file holds the sentences, as of drifts
+    rounds: tuple[Round, ...] = ()
+    effects: tuple[str, ...] = ()
+    explanation: str = ""
+    fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
+    ladder: Annotated[Table | None, Field(exclude=True)] = None
+    drift: Annotated[Sequence[Mapping[str, Any]], PlainSerializer(_told)] = ()
+    where: Sentences = ()
     next_experiment: Mapping[str, Any] | None = None
     missing_force: Mapping[str, Any] | None = None
-    notes: Sequence[Remark | str] = ()  # A file holds their sentences
-    failure: Failure | None = None
-    force_table: pd.DataFrame | None = None
-    learned_table: pd.DataFrame | None = None
-    stored_parameters: tuple[Number, ...] = ()
+    notes: Sentences = ()
+    failure: Annotated[Failure | None, Field(exclude=True)] = None
+    force_table: Annotated[Table | None, Field(exclude=True)] = None
+    learned_table: Annotated[Table | None, Field(exclude=True)] = None
+    stored_parameters: Annotated[tuple[Number, ...], Field(alias="parameters")] = ()
     contradicted_columns: tuple[str, ...] = ()
     refused: str = ""
-    power: Power | None = None
+    power: StoredPower | None = None
     odd_trials: tuple[str, ...] = ()
 
     @property
@@ -267,50 +266,24 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """Content of `diagnosis.json`; numbers in SI units."""
-        first = self.rounds[0].to_json() if self.rounds else {}
+        content = super().to_json()
         return {
+            **content,
             "verdict": self.verdict or None,
-            "effects": list(self.effects),
-            "answer_set": list(self.answer_set),
-            "explanation": self.explanation,
             "final_verdict": self.final_verdict or None,
-            "rounds": [step.to_json() for step in self.rounds],
+            "answer_set": list(self.answer_set),
+            "cosines": content["rounds"][0]["cosines"] if self.rounds else {},
             "parameters": [number.to_json() for number in self.parameters],
-            "cosines": first.get("cosines", {}),
-            "where": [str(line) for line in self.where],
-            "drift": [{key: str(v) if isinstance(v, Remark) else v for key, v in row.items()} for row in self.drift],
-            "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
-            "missing_force": None if self.missing_force is None else dict(self.missing_force),
-            "notes": [str(note) for note in self.notes],
-            "odd_trials": list(self.odd_trials),
-            "contradicted_columns": list(self.contradicted_columns),
             "refused": self.refused or None,
-            "power": None if self.power is None else self.power.to_json(),
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any], ladder: pd.DataFrame | None = None) -> Diagnosis:
         """Read what `to_json` wrote."""
-        rounds = list(content.get("rounds") or [{}] if content.get("verdict") else [])
-        if rounds:
-            whole = {key: content[key] for key in ("verdict", "answer_set", "cosines") if key in content}
-            rounds[0] = {**whole, **rounds[0]}
-        return cls(
-            rounds=tuple(Round.from_json(stored) for stored in rounds),
-            effects=tuple(content.get("effects") or ()),
-            explanation=str(content.get("explanation") or ""),
-            ladder=ladder,
-            drift=tuple(content.get("drift") or ()),
-            where=tuple(str(line) for line in content.get("where") or ()),
-            next_experiment=content.get("next_experiment"),
-            missing_force=content.get("missing_force"),
-            notes=tuple(str(note) for note in content.get("notes") or ()),
-            stored_parameters=tuple(Number.from_json(stored) for stored in content.get("parameters") or ()),
-            odd_trials=tuple(content.get("odd_trials") or ()),
-            contradicted_columns=tuple(content.get("contradicted_columns") or ()),
-            refused=str(content.get("refused") or ""),
-            power=Power.from_json(content["power"]) if content.get("power") else None,
-        )
+        stored = {key: value for key, value in content.items() if value is not None}
+        if "verdict" in stored and not stored.get("rounds"):
+            stored["rounds"] = [{"verdict": stored["verdict"]}]
+        return replace(super().from_json(stored), ladder=ladder)
 
     def plot(self, name: str = "", **options: Any) -> Figure:
         """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name."""

@@ -292,11 +292,11 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     range of the trials. The part that B, n and the yield pressure could absorb is undetermined, and included in the
     band.
     """
-    variables = [name for name in _FORCE_AXES if name in learned_force and learned_force[name].notna().any()]
-    if not len(learned_force) or not variables:
+    if not len(learned_force):
         return None
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
+    variables = [name for name in _FORCE_AXES if name in grid and grid[name].notna().any()]
     conditions = f"N = {along['condition'].nunique()} conditions"
     if len(variables) == 2:
         fig = st.new_figure(9.6, 4.4)

@@ -413,12 +413,10 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
     if law.factor:
         by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}[law.factor]
         form, place = f"{form}, times {by}", "{size} at its largest"
+    scale = law.shapes[0] if law.shapes else math.nan
+    ends = {"low": f"{1e3 * max(scale, 0.0):.0f}", "high": f"{1e3 * sum(law.shapes):.0f}"}
     text = (f"{form}, {place}" if place else form).format(
-        size=size,
-        low=f"{1e3 * max(law.low, 0.0):.0f}",
-        high=f"{1e3 * law.high:.0f}",
-        milli=number(1e3 * law.scale),
-        scale=f"{law.scale:.2g}",
+        size=size, milli=number(1e3 * scale), scale=f"{scale:.2g}", **ends
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
 
@@ -494,13 +492,13 @@ def proposal_lines(proposal: Proposal) -> list[str]:
     """Return which laws of force were fitted and what resulted, a line a sentence."""
     lines = []
     for law in proposal.laws if proposal.tied else ():
-        line = f"{law.law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
+        line = f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
         if math.isfinite(law.rms_left_out_m):
             errors_mm = 1e3 * proposal.rms_left_out_m, 1e3 * law.rms_left_out_m
             line += ", error on left-out conditions {:.2f} → {:.2f} mm".format(*errors_mm)
         lines.append(line + " (not excluded)" * (law in proposal.tied[1:]))
     if proposal.tied:
-        best, *others = [law.law.words for law in proposal.tied]
+        best, *others = [law.words for law in proposal.tied]
         lines.append(f"Proposed: {best}.")
         lines += [f"These data fit nearly as well with {joined(others)}."] if others else []
     else:
@@ -525,8 +523,8 @@ def learned_file_text(learned: LearnedForce, origin: str) -> str:
     shown = {"growth": ("y", "mm", 1e3), "speed": ("ẋ", "m/s", 1.0), "time": ("t", "ms", 1e3),
              "pressure": ("P", "kPa", 1e-3)}  # fmt: skip
     ranges = [
-        f"{_variables_text(name)} from {low * shown[name][2]:.3g} to {high * shown[name][2]:.3g} {shown[name][1]}"
-        for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
+        f"{_variables_text(axis.name)} from {axis.low * times:.3g} to {axis.high * times:.3g} {unit}"
+        for axis, (_, unit, times) in ((axis, shown[axis.name]) for axis in domain.axes)
     ]
     validity = sentence("valid_where_learned", {"ranges": ranges})
     symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))

@@ -72,7 +72,7 @@ Report = Callable[[str], None]
 
 def propose_effect(experiment: Experiment, folder: Path, to: Path | None, say: Report) -> tuple[list[str], list[Path]]:
     """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
-    from vinetrack.diagnosis.propose import effect_text, propose, table_text
+    from vinetrack.diagnosis.propose import propose
     from vinetrack.diagnosis.result import UNEXPLAINED
     from vinetrack.narrative.diagnosis_text import proposal_lines
     from vinetrack.narrative.verdict_text import verdict_sentence
@@ -97,10 +97,10 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, say: R
     if proposal.tied:
         best = proposal.tied[0]
         origin = remark("law_origin", **facts, rms_m=best.rms_left_out_m, gain=best.ratio.delta_chi2)
-        files.append((best.effect.path.name, effect_text(best.law, str(origin))))
+        files.append((best.effect.path.name, best.text(str(origin))))
     if (table := proposal.table) is not None:
         origin = remark("table_origin", **facts, rms_m=table.rms_left_out_m)
-        files.append((table.effect.path.name, table_text(table.learned, str(origin))))
+        files.append((table.effect.path.name, table.text(str(origin))))
     paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
     if to is not None and paths:
         paths[0] = to

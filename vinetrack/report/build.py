@@ -246,10 +246,10 @@ TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
 def tied_pairs(entry: Round) -> list[str]:
     """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
-    names = list(map(spaced_name, entry.cosine_names))
+    names = list(map(spaced_name, entry.cosines.effects))
     pairs = [
         (abs(value), f"{names[j]} and {names[i]} (cosine {number(value)})")
-        for i, row in enumerate(entry.cosines)
+        for i, row in enumerate(entry.cosines.matrix)
         for j, value in enumerate(row[:i])
         if is_finite(value) and abs(value) >= TIED_COSINE
     ]
