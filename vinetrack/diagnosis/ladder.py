@@ -106,7 +106,7 @@ FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at whic
 @dataclass(frozen=True, repr=False)
 class Comparison:
     """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`. `trajectories` holds
-    the trials of each condition with the model's prediction, see `trajectory_table`. `trials` are the predictions.
+    the frames of each condition with the model's prediction, see `Replicates`. `trials` are the predictions.
     """
 
     table: pd.DataFrame
@@ -156,7 +156,7 @@ def compare(
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
-        trajectories[condition] = trajectory_table(together)
+        trajectories[condition] = together.frames
     return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(predicted))
 
 
@@ -169,29 +169,22 @@ def rms_of(trials: Iterable[TrialFit]) -> float:
 
 
 def position_errors(together: Replicates) -> dict[str, float]:
-    """Position errors of one condition: columns of `comparison.csv`, m, s and ratios."""
+    """Position errors of one condition: columns of `comparison.csv`, m, s and ratios. The worst place is that of the
+    largest mean residual of the replicates, smoothed.
+    """
     rms_m, floor_m = rms_of(together.trials), together.floor_m
-    worst_at_s, worst_at_m = _worst(together)
+    moving = together.instants[together.instants["moves"]]
+    # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
+    width = 2 * int(0.05 * len(moving) / 2) + 1
+    smoothed_m = moving["mean_m"].rolling(width, center=True, min_periods=1).mean()
+    worst = moving.loc[smoothed_m.abs().idxmax()]
     return {
         "rms_position_m": rms_m,
         "replicate_floor_m": floor_m,
         "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
-        "worst_at_s": worst_at_s,
-        "worst_at_m": worst_at_m,
+        "worst_at_s": float(worst["time_s"]),
+        "worst_at_m": float(worst["lead_position_m"]),
     }
-
-
-def _worst(together: Replicates) -> tuple[float, float]:
-    """Time since release and growth where the smoothed mean residual of the replicates is largest."""
-    residual_m, time_s = together.mean_residual_m[together.moving], together.time_s[together.moving]
-    if not time_s.size:
-        return math.nan, math.nan
-    # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
-    half, places = int(0.05 * residual_m.size / 2), np.arange(residual_m.size)
-    cumulative = np.concatenate([[0.0], np.cumsum(residual_m)])
-    low, high = np.maximum(places - half, 0), np.minimum(places + half + 1, residual_m.size)
-    worst = int(np.argmax(np.abs((cumulative[high] - cumulative[low]) / (high - low))))
-    return float(time_s[worst]), float((together.model_m[together.moving] + residual_m)[worst])
 
 
 def _final_speed_errors(
@@ -229,30 +222,6 @@ def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats
         return None
     known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
     return track.time_s[known] - release_s, track.pressure_Pa[known]
-
-
-def trajectory_table(together: Replicates) -> pd.DataFrame:
-    """Trials of one condition with the model, since release and from the origin.
-    `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
-    """
-    import pandas as pd
-
-    mean_m, sigma_m = together.model_m + together.mean_residual_m, np.sqrt(together.variance_m2)
-    step_s = float(np.diff(together.time_s)[0]) if together.time_s.size > 1 else 1.0
-    parts = []
-    for trial in together.trials:
-        time_s = trial.time_s - trial.release_s
-        k = np.clip(np.rint((time_s - together.time_s[0]) / step_s).astype(int), 0, mean_m.size - 1)
-        columns = {
-            "trial": trial.name,
-            "time_s": time_s,
-            "lead_position_m": trial.lead_position_m - trial.origin_m,
-            "model_position_m": trial.predicted_position_m - trial.origin_m,
-            "replicates_mean_m": mean_m[k],
-            "replicates_sigma_m": sigma_m[k],
-        }
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
 
 
 # ------------------------------------------------------------------------------

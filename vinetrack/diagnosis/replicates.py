@@ -14,11 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
@@ -40,6 +38,9 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE,
 from vinetrack.inference.solving import as_recorded
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 from vinetrack.tracks.position_noise import rest_points
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # ------------------------------------------------------------------------------
 # Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
@@ -204,73 +205,67 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Replicates:
-    """Residuals of the trials of one condition at common times since release, shape (n_trials, n_times), NaN where a
-    trial is absent: measurement minus model. `model_m`, shape (n_times,), is the model's growth in the longest trial.
+    """Trials of one condition: all `frames`, since release and from the origin, with the mean of the replicates then
+    and their standard deviation; and the mean and variance of the residuals, measurement minus model, at `instants` one
+    frame apart, with the number of trials present and whether any of them has begun to move.
     """
 
     trials: Sequence[TrialFit]
-    time_s: Floats
-    model_m: Floats
-    residual_m: Floats
-
-    @cached_property
-    def present(self) -> Floats:
-        """Number of trials present at each time, shape (n_times,)."""
-        return np.isfinite(self.residual_m).sum(axis=0).astype(float)
-
-    @cached_property
-    def moving(self) -> NDArray[np.bool_]:
-        """Times at which a trial that has begun to move is present, shape (n_times,)."""
-        begin_s = min(float(trial.time_s[first_that_counts(trial)]) - trial.release_s for trial in self.trials)
-        return (self.time_s >= begin_s - 1e-9) & (self.present > 0)
-
-    @cached_property
-    def mean_residual_m(self) -> Floats:
-        """Mean of the replicates minus the model, shape (n_times,); NaN where none is present."""
-        return np.where(self.present > 0, np.nansum(self.residual_m, axis=0) / np.maximum(self.present, 1), math.nan)
-
-    @cached_property
-    def variance_m2(self) -> Floats:
-        """Unbiased variance of single replicates, shape (n_times,); NaN where fewer than two are present."""
-        square = np.nansum((self.residual_m - self.mean_residual_m) ** 2, axis=0)
-        return np.where(self.present > 1, square / np.maximum(self.present - 1, 1), math.nan)
+    frames: pd.DataFrame
+    instants: pd.DataFrame
 
     @property
     def floor_m(self) -> float:
         """Replicate floor: rms deviation of a replicate from the mean of infinitely many; NaN for one trial alone."""
-        use = self.moving & (self.present > 1)
-        return math.sqrt(np.average(self.variance_m2[use], weights=self.present[use])) if use.any() else math.nan
+        use = self.instants[self.instants["moves"] & (self.instants["present"] > 1)]
+        return math.sqrt(np.average(use["variance_m2"], weights=use["present"])) if len(use) else math.nan
 
 
 def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
-    """Residuals of a model for the trials of one condition at common times. Each instant uses the nearest frame of each
-    trial: interpolation would average the noise of positions away, and positions, other than residuals, change by much
+    """Residuals of a model for the trials of one condition at common times. A frame counts at the instant nearest to
+    it: interpolation would average the noise of positions away, and positions, other than residuals, change by much
     more than their noise within half a frame.
     """
-    from scipy.interpolate import PchipInterpolator
+    import pandas as pd
 
-    since_s = [trial.time_s - trial.release_s for trial in trials]
-    longest = max(range(len(trials)), key=lambda i: since_s[i][-1])
-    frame_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
-    begin_s, end_s = min(float(each[0]) for each in since_s), since_s[longest][-1]
-    time_s = begin_s + frame_s * np.arange(math.floor((end_s - begin_s) / frame_s + 1e-6) + 1)
-    growth = PchipInterpolator(since_s[longest], trials[longest].predicted_position_m - trials[longest].origin_m)
-    model_m = np.asarray(growth(np.clip(time_s, since_s[longest][0], end_s)))
-    residual_m = np.array([_nearest(time_s, *pair) for pair in zip(since_s, trials, strict=True)])
-    return Replicates(trials, time_s, model_m, residual_m)
+    step_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
+    parts = [
+        pd.DataFrame(
+            {
+                "trial": trial.name,
+                "time_s": trial.time_s - trial.release_s,
+                "lead_position_m": trial.lead_position_m - trial.origin_m,
+                "model_position_m": trial.predicted_position_m - trial.origin_m,
+                "residual_m": trial.residual_m,
+                "moves": np.arange(trial.time_s.size) >= first_that_counts(trial),
+            }
+        )
+        for trial in trials
+    ]
+    frames = pd.concat(parts, ignore_index=True)
+    instant = np.rint(frames["time_s"] / step_s)
+    residual_m = frames.pivot_table("residual_m", instant, "trial")
+    of_instant = frames.groupby(instant)
+    instants = pd.DataFrame(
+        {
+            "time_s": step_s * residual_m.index,
+            "lead_position_m": of_instant["lead_position_m"].mean(),
+            "mean_m": residual_m.mean(axis=1),
+            "variance_m2": residual_m.var(axis=1),
+            "present": residual_m.count(axis=1),
+            "moves": of_instant["moves"].any(),
+        }
+    )
+    at = instants.loc[instant]
+    frames["replicates_mean_m"] = frames["model_position_m"] + at["mean_m"].to_numpy()
+    frames["replicates_sigma_m"] = np.sqrt(at["variance_m2"].to_numpy())
+    return Replicates(trials, frames.drop(columns=["residual_m", "moves"]), instants)
 
 
 def replicates_by_condition(trials: Sequence[TrialFit]) -> dict[str, Replicates]:
     """The replicates of each condition, in order."""
     names = dict.fromkeys(trial.trial.condition for trial in trials)
     return {name: replicates_of([trial for trial in trials if trial.trial.condition == name]) for name in names}
-
-
-def _nearest(at_s: Floats, since_s: Floats, trial: TrialFit) -> Floats:
-    """Residuals of the frames nearest to times since release, NaN where none is within half a frame's spacing."""
-    k = np.clip(np.searchsorted(since_s, at_s), 1, since_s.size - 1)
-    k -= at_s - since_s[k - 1] < since_s[k] - at_s
-    return np.where(np.abs(since_s[k] - at_s) <= 0.51 * np.median(np.diff(since_s)), trial.residual_m[k], math.nan)
 
 
 def first_that_counts(trial: TrialFit) -> int:
