@@ -2,17 +2,19 @@
 size a target power; and those that would reveal most of what could be missing.
 
 Designs are evaluated by linear theory: one trial of every condition is simulated once, information adds up over trials,
-and trials are added one by one and exchanged until none gains (Fedorov 1972, Theory of Optimal Experiments).
+and trials are added one by one, each the best beside those before it (Fedorov 1972, Theory of Optimal Experiments).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -110,24 +112,23 @@ def conditions_by_effort(
         yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
-def exchanged(design: Sequence[int], allowed: NDArray[np.intp], worth: Criterion) -> list[int]:
-    """Exchange the trials of a design one at a time for others of those allowed until none gains."""
-    design, best = list(design), float(worth(design)[0])
-    for _ in range(4):
-        before = best
-        for k in range(len(design)):
-            values = worth(design[:k] + design[k + 1 :], allowed)
-            if np.max(values) > (1 + 1e-6) * best:  # a gain, not rounding
-                design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
-        if best <= before:
+def added_one_by_one(allowed: NDArray[np.intp], worth: Criterion, most: int) -> list[int]:
+    """The trials of a design, each the best of those allowed beside the ones before it, as long as it gains."""
+    design: list[int] = []
+    now = float(worth(design)[0])
+    while len(design) < most:
+        values = worth(design, allowed)
+        if not np.max(values) > now:
             break
+        design.append(int(allowed[int(np.argmax(values))]))
+        now = float(np.max(values))
     return design
 
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
 #
-# Every condition within the limits is rated by linear theory, and the best set of trials found by exchange. Its
+# Every condition within the limits is rated by linear theory, and trials are added one by one. Their
 # separation is predicted by refitting simulated trials. Where no trials help, or only measurements are in question, the
 # advice is what to measure instead.
 
@@ -240,8 +241,8 @@ def worth(between: Floats) -> Floats:
 def _best_option(
     tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits, seed: int
 ) -> tuple[list[Condition], Floats]:
-    """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
-    exchanged one at a time. Returns design, rises (see `simulated_rises`).
+    """The best set of trials of the least effort that is sufficient, else of all. Returns design, rises (see
+    `simulated_rises`).
     """
 
     def worth_of(*design: Any) -> Floats:
@@ -257,8 +258,7 @@ def _best_option(
     options: list[tuple[list[Condition], Floats]] = []
     before = -math.inf
     for _, allowed in conditions_by_effort(conditions, best_vines):
-        start = [int(allowed[int(np.argmax(worth_of((), allowed, limits.trials)))])] * limits.trials
-        design = sorted(exchanged(start, allowed, worth_of))
+        design = sorted(added_one_by_one(allowed, worth_of, limits.trials))
         predicted = float(worth_of(design)[0])
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
@@ -416,90 +416,55 @@ def further_trials(
     def information(design: Sequence[int], added: NDArray[np.intp] | None = None, times: float = 1.0) -> Floats:
         return np.maximum(designs.left(design, added, REPLICATES * times)[:, 0, 0], 0.0)
 
-    deviation = abs(value - now.zero)
-    wanted = float(information(())[0]) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
-    if not math.isfinite(wanted):
-        # 4.7: score that a size needs where the trials so far have no information about it (derived)
-        wanted = (4.7 / deviation) ** 2
     conditions = [condition for condition, _ in films]
-    # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
-    for _ in range(3):
-        chosen, needed = _fewest(conditions, information, wanted, most)
-        made, power = _made(replace(tests, fit=fit), [films[k] for k in chosen], plan)
-        plan = replace(plan, trials=made, power=power, n_conditions=len(films), needed=needed)
-        shortfall = abs(power.size_at(target) - now.zero) / deviation
-        if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most:
-            break
-        wanted = 1.02 * float(information(chosen)[0]) * shortfall**2
-    endless, known = information(range(len(films)), times=UNLIMITED), information(chosen[: len(made) // REPLICATES])
-    ratio = math.sqrt(endless[0] / max(known[0], 1e-300))
-    unlimited = plan.power.probability_at(plan.power.zero + ratio * (value - plan.power.zero))
-    return replace(plan, unlimited=max(unlimited, plan.after))
+    vines = np.array([condition.trial.vine for condition in conditions])
 
-
-def _fewest(
-    conditions: Sequence[Condition], information: Criterion, wanted: float, most: int
-) -> tuple[list[int], dict[str, int]]:
-    """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
-
-    def cost(chosen: Sequence[int]) -> tuple[float, float]:
-        known = float(information(chosen)[0])
-        return (len(chosen), 0.0) if known >= wanted else (math.inf, -known)
-
-    def best_vines(places: NDArray[np.intp]) -> list[str]:
-        """The new vines with the largest information in unlimited trials of all their conditions."""
-        vines = np.array([condition.trial.vine for condition in conditions])
+    def best_vine(places: NDArray[np.intp]) -> list[str]:
+        """The new vine with the largest information in unlimited trials of all its conditions."""
         known = {vine: information(np.flatnonzero(vines == vine), times=UNLIMITED)[0] for vine in vines[places]}
-        # 2: new vines that are tried, one at a time (chosen)
-        return sorted(known, key=lambda vine: -known[vine])[:2]
+        return [max(known, key=lambda vine: known[vine])]
 
-    options: dict[str, list[int]] = {}
     effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-    for effort, allowed in conditions_by_effort(conditions, best_vines):
-        words, chosen = effort_words[effort], _smallest(allowed, information, wanted, most)
-        options[words] = min(options.get(words, chosen), chosen, key=cost)
-    reached = {words: REPLICATES * len(chosen) for words, chosen in options.items() if cost(chosen)[0] < math.inf}
-    return min(options.values(), key=cost, default=[]), reached
+    chosen, power, needed = list[int](), cache(lambda _: now), dict[str, int]()
+    for effort, allowed in conditions_by_effort(conditions, best_vine):
+        pairs = added_one_by_one(allowed, information, most)
+        if not pairs:
+            continue
+        with_pairs = _power_with(replace(tests, fit=fit), [films[k] for k in pairs], now)
+        short = len(pairs)
+        if with_pairs(short).probability_at(value) >= target:
+            short = bisect_left(range(1, short), target, key=lambda k, of=with_pairs: of(k).probability_at(value))
+            # With more effort only fewer trials are worth it.
+            most, needed[effort_words[effort]] = short, REPLICATES * (short + 1)
+        if short < len(pairs) or not needed:
+            chosen, power = pairs[: short + 1], with_pairs
+    made: list[dict[str, Any]] = []
+    for k, place in enumerate(chosen, 1):
+        cells = _entry(conditions[place], "yield_pressure_kPa", "capture_fps")
+        known = {name: cell for name, cell in cells.items() if cell == cell}  # NaN is not equal to itself
+        made += [{**known, "probability": power(k).probability_at(value)}] * REPLICATES
+    final = power(len(chosen))
+    plan = replace(plan, power=final, trials=tuple(made), needed=needed, n_conditions=len(films))
+    endless, so_many = information(range(len(films)), times=UNLIMITED)[0], information(chosen)[0]
+    away = math.sqrt(endless / max(so_many, 1e-300)) * (value - final.zero)
+    return replace(plan, unlimited=max(final.probability_at(final.zero + away), plan.after))
 
 
-def _smallest(allowed: NDArray[np.intp], information: Criterion, wanted: float, most: int) -> list[int]:
-    """Pairs added one by one up to the wanted information, exchanged, and as many as are needed of these, the most
-    informative first.
-    """
-    chosen: list[int] = []
-    now = float(information(chosen)[0])
-    while now < wanted and len(chosen) < most:
-        values = information(chosen, allowed)
-        if not np.max(values) > now:
-            break
-        chosen.append(int(allowed[int(np.argmax(values))]))
-        now = float(np.max(values))
-    chosen = exchanged(chosen, allowed, information)
-    order: list[int] = []
-    while chosen and (not order or information(order)[0] < wanted):
-        order.append(chosen.pop(int(np.argmax(information(order, np.array(chosen))))))
-    return order
-
-
-def _made(
-    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], plan: FurtherTrials
-) -> tuple[tuple[dict[str, Any], ...], EffectPower]:
-    """Pairs of these trials, as many as needed, with the probability after each; and the power with them."""
-    before, power, probability = len(tests.fit.trials), plan.power, plan.before
+def _power_with(
+    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], now: EffectPower
+) -> Callable[[int], EffectPower]:
+    """The power for an effect with the first so many pairs of these trials."""
     different = list({condition.trial.name: (condition, film) for condition, film in films}.values())
     with_all = misfit_tests(extended_fit(tests.fit, different), tests.effects, tests.level)
     places = {trial.name: k for k, trial in enumerate(with_all.fit.trials)}
-    rows, trials = list(range(before)), []
-    for condition, _ in films:
-        if probability >= plan.target:
-            break
-        rows += [places[condition.trial.name]] * REPLICATES
-        power = effect_power(_of_trials(with_all, rows), power.effect) or power
-        probability = power.probability_at(plan.value)
-        cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
-        known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
-        trials += [{**known, "probability": probability}] * REPLICATES
-    return tuple(trials), power
+    added = [places[condition.trial.name] for condition, _ in films for _ in range(REPLICATES)]
+
+    @cache
+    def power(pairs: int) -> EffectPower:
+        rows = [*range(len(tests.fit.trials)), *added[: REPLICATES * pairs]]
+        return effect_power(_of_trials(with_all, rows), now.effect) or now
+
+    return power
 
 
 def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
