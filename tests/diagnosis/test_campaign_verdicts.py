@@ -107,7 +107,8 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
     vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
     asked = score_test.effect_sensitivities(fit, score_test.shapes_of(FILM, [trial.trial for trial in fit.trials]))
     assert [shape.group for shape in asked.shapes] == ["", *vines]
-    for trial, columns in zip(fit.trials, asked.columns, strict=True):
+    for trial, *moved in zip(fit.trials, *asked.columns, strict=True):
+        columns = np.column_stack(moved)
         alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
         assert np.any(alone.pop(trial.trial.vine))
         assert not any(np.any(of_other) for of_other in alone.values())

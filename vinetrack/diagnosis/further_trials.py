@@ -475,5 +475,4 @@ def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
     columns, cross_products = tuple(solution.columns[k] for k in places), solution.cross_products[rows]
     solution = replace(solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
     part, products = at_solution(fit, predictor, solution), tests.products.of(places)
-    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
-    return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
+    return replace(tests, fit=part, products=products, scores=scores_of(part, products))

@@ -218,12 +218,12 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
 
 @dataclass(frozen=True)
 class EffectSensitivities:
-    """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size. `silent`
-    names the effects to which no trajectory responds at any plausible size.
+    """Changes of the positions of each trial, in the order of `shapes`, per unit of each size. `silent` names the
+    effects to which no trajectory responds at any plausible size.
     """
 
     shapes: tuple[CandidateShape, ...]
-    columns: list[Floats]
+    columns: list[list[Floats]]
     silent: tuple[str, ...]
 
     @property
@@ -249,18 +249,8 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
             responding = [each for shape in finite if (each := _sensitivity(fit, shape, baseline)) is not None]
         responses += responding
         detected |= {name} if responding else set()
-    columns = [_columns_of_trial(responses, i, trajectory.time_s.size) for i, trajectory in enumerate(baseline)]
-    return EffectSensitivities(
-        tuple(shape for shape, _ in responses), columns, tuple(name for name in names if name not in detected)
-    )
-
-
-def _columns_of_trial(responses: Sequence[tuple[CandidateShape, list[Floats]]], i: int, points: int) -> Floats:
-    """Columns of one trial, shape (n_points, n_shapes). The list entries are released, to save memory."""
-    columns = np.empty((points, len(responses)))
-    for k, (_, columns_of_trials) in enumerate(responses):
-        columns[:, k], columns_of_trials[i] = columns_of_trials[i], np.empty(0)
-    return columns
+    silent = tuple(name for name in names if name not in detected)
+    return EffectSensitivities(tuple(shape for shape, _ in responses), [moved for _, moved in responses], silent)
 
 
 def _sensitivity(
@@ -374,14 +364,15 @@ class Products:
 
 
 def products_of(fit: Fit, sensitivities: EffectSensitivities, systematics: Systematics) -> Products:
-    """Assemble the columns of a fit, of its systematic errors and of the candidates. Afterwards the columns of
-    `sensitivities` are views of those made here, so that no trial's are held twice.
+    """Assemble the columns of a fit, of its systematic errors and of the candidates, which `sensitivities` lose: no
+    trial's are held twice.
     """
     of_fit, problem = systematics.added_to(fit.solution.columns, fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):
-        assembled.append(np.column_stack([columns_of_trial, sensitivities.columns[i]]))
-        sensitivities.columns[i] = assembled[-1][:, columns_of_trial.shape[1] :]
+        assembled.append(np.column_stack([columns_of_trial, *(moved[i] for moved in sensitivities.columns)]))
+        for moved in sensitivities.columns:
+            moved[i] = np.empty(0)
     return Products(tuple(assembled), fit.predictor.data, problem, len(sensitivities.shapes))
 
 
