@@ -22,13 +22,7 @@ from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.replicates import (
-    dropped_frames_in,
-    lost_frames,
-    odd_trials,
-    with_lost_frames,
-    with_odd_trials,
-)
+from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -79,35 +73,33 @@ def diagnose(
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
-    outliers_note = ""
     if isinstance(source, Fit):
-        effects = candidates_of(source.model, candidates, user_effects)
-        fit, dropped = with_host(source, host_for(source.model, effects)), dropped_frames_in(source)
+        fitted, model, source = source, source.model, source.pairs
+    settings = _settings(source)
+    if settings is not None:
+        source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
+        model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
+        candidates = stated_candidates if candidates is None else candidates
+        limits = limits or stated_limits
+    model = model or base_model()
+    effects = candidates_of(model, candidates, user_effects)
+    pairs, left_out = pairs_of(source, tracks)
+    if settings is None:  # the tracks of an experiment were corrected as they were read
+        pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
+    dropped = lost_frames(pairs)
+    outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
+    report("fitting the model")
+    if fitted is None or dropped:
+        fit = initial_fit(model, pairs, effects, profile=False)
     else:
-        settings = _settings(source)
-        if settings is not None:
-            source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
-            model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
-            candidates = stated_candidates if candidates is None else candidates
-            limits = limits or stated_limits
-        model = model or base_model()
-        effects = candidates_of(model, candidates, user_effects)
-        pairs, left_out = pairs_of(source, tracks)
-        if settings is None:  # the tracks of an experiment were corrected as they were read
-            pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
-        dropped = lost_frames((trial.name, track) for trial, track in pairs)
-        outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
-        report("fitting the model")
-        fit = fitted if fitted is not None and not dropped else initial_fit(model, pairs, effects, profile=False)
-        fit = replace(fit, left_out={**left_out, **fit.left_out})
-    result = _diagnosis_of(fit, effects, report)
-    if not isinstance(source, Fit):
+        fit = with_host(fitted, host_for(model, effects))
+    fit = replace(fit, left_out={**left_out, **fit.left_out})
 
-        def without(names: Sequence[str]) -> Diagnosis:
-            remaining = [pair for pair in pairs if pair[0].name not in names]
-            return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
+    def without(names: Sequence[str]) -> Diagnosis:
+        remaining = [pair for pair in pairs if pair[0].name not in names]
+        return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
 
-        result = with_odd_trials(result, odd_trials(fit.predictor.data), without)
+    result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
     result = with_lost_frames(result, dropped)
     if outliers_note:
         result = replace(result, notes=(*result.notes, outliers_note))

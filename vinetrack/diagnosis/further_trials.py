@@ -421,19 +421,18 @@ def further_trials(
 
     def best_vine(places: NDArray[np.intp]) -> list[str]:
         """The new vine with the largest information in unlimited trials of all its conditions."""
-        known = {vine: information(np.flatnonzero(vines == vine), times=UNLIMITED)[0] for vine in vines[places]}
+        known = {v: information(np.flatnonzero(vines == v).tolist(), times=UNLIMITED)[0] for v in vines[places]}
         return [max(known, key=lambda vine: known[vine])]
 
     effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-    chosen, power, needed = list[int](), cache(lambda _: now), dict[str, int]()
+    chosen, needed = list[int](), dict[str, int]()
+    power: Callable[[int], EffectPower] = cache(lambda _: now)
     for effort, allowed in conditions_by_effort(conditions, best_vine):
         pairs = added_one_by_one(allowed, information, most)
         if not pairs:
             continue
-        with_pairs = _power_with(replace(tests, fit=fit), [films[k] for k in pairs], now)
-        short = len(pairs)
-        if with_pairs(short).probability_at(value) >= target:
-            short = bisect_left(range(1, short), target, key=lambda k, of=with_pairs: of(k).probability_at(value))
+        short, with_pairs = _with_pairs(replace(tests, fit=fit), [films[k] for k in pairs], plan)
+        if short < len(pairs):
             # With more effort only fewer trials are worth it.
             most, needed[effort_words[effort]] = short, REPLICATES * (short + 1)
         if short < len(pairs) or not needed:
@@ -450,10 +449,10 @@ def further_trials(
     return replace(plan, unlimited=max(final.probability_at(final.zero + away), plan.after))
 
 
-def _power_with(
-    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], now: EffectPower
-) -> Callable[[int], EffectPower]:
-    """The power for an effect with the first so many pairs of these trials."""
+def _with_pairs(
+    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], plan: FurtherTrials
+) -> tuple[int, Callable[[int], EffectPower]]:
+    """How many pairs of these trials, in their order, fall short of the target, and the power with so many of them."""
     different = list({condition.trial.name: (condition, film) for condition, film in films}.values())
     with_all = misfit_tests(extended_fit(tests.fit, different), tests.effects, tests.level)
     places = {trial.name: k for k, trial in enumerate(with_all.fit.trials)}
@@ -462,9 +461,13 @@ def _power_with(
     @cache
     def power(pairs: int) -> EffectPower:
         rows = [*range(len(tests.fit.trials)), *added[: REPLICATES * pairs]]
-        return effect_power(_of_trials(with_all, rows), now.effect) or now
+        return effect_power(_of_trials(with_all, rows), plan.power.effect) or plan.power
 
-    return power
+    def probability(pairs: int) -> float:
+        return power(pairs).probability_at(plan.value)
+
+    reached = probability(len(films)) >= plan.target
+    return bisect_left(range(1, len(films)), plan.target, key=probability) if reached else len(films), power
 
 
 def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:

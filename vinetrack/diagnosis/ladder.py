@@ -177,7 +177,7 @@ def position_errors(together: Replicates) -> dict[str, float]:
     # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
     width = 2 * int(0.05 * len(moving) / 2) + 1
     smoothed_m = moving["mean_m"].rolling(width, center=True, min_periods=1).mean()
-    worst = moving.loc[smoothed_m.abs().idxmax()]
+    worst = moving.iloc[int(np.argmax(smoothed_m.abs()))]
     return {
         "rms_position_m": rms_m,
         "replicate_floor_m": floor_m,

@@ -12,14 +12,14 @@ are estimated from differences between replicates alone, so that a model that fa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
+from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -32,11 +32,11 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
 from vinetrack.inference.solving import as_recorded
-from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
+from vinetrack.tracks.frame_timing import frames_surely_missing
 from vinetrack.tracks.position_noise import rest_points
 
 if TYPE_CHECKING:
@@ -171,17 +171,11 @@ def _overruled(result: Diagnosis, words: str, **first: Any) -> Diagnosis:
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
 
 
-def lost_frames(tracks: Iterable[tuple[str, Track]]) -> dict[str, bool]:
+def lost_frames(pairs: Pairs) -> dict[str, bool]:
     """Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain."""
-    return {name: frames_surely_missing(track) for name, track in tracks if with_flag(track.flag, "retimed").any()}
-
-
-def dropped_frames_in(fit: Fit) -> dict[str, bool]:
-    """Find trials of a fit whose dropped frames were not corrected, as `lost_frames`."""
-    return lost_frames(
-        (trial_data.trial.name, correct_frames(plain_track(trial_data.time_s, trial_data.lead_position_m)))
-        for trial_data in fit.predictor.data
-    )
+    return {
+        trial.name: frames_surely_missing(track) for trial, track in pairs if with_flag(track.flag, "retimed").any()
+    }
 
 
 def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
