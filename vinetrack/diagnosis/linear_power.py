@@ -420,7 +420,6 @@ def _false_alarms(fit: Fit) -> dict[str, float]:
         "any smooth force": 0.1 * level,
         "the loudest probe": min(SINGLE_PROBE_LEVEL, level),
         "replicates that err alike": 0.1 * level,
-        "noise that is larger in motion": 0.1 * level,
     }
     trials = [trial.trial for trial in fit.trials]
     if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):
