@@ -45,11 +45,9 @@ from vinetrack.inference.sensitivity import position_change
 
 NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
-
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
 
-# Columns that only a tube has, and what an effect that needs them acts on
 COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
 
 
@@ -79,35 +77,28 @@ class CandidateShape:
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, Remark]]:
-    """Candidates that these trials can test, and for the others the reason why not. Returns testable, reasons (why each
-    of the others cannot be tested, by name).
-    """
-    tube_only_columns = ("chamber_l", "inlet_mm", "yield_pressure_kPa")
-    can_act: list[Effect] = []
-    reasons: dict[str, Remark] = {}
-    no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
-    for effect in candidates:
-        if no_tube and (absent := [column for column in effect.needs if column in tube_only_columns]):
-            reasons[effect.name] = remark("no_tube", column=absent[0])
-            continue
-        if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
-            reasons[effect.name] = remark("in_measured_pressure")
-            continue
-        if "trace_time" in effect.functions and all(trial_data.trace is None for trial_data in data):
-            reasons[effect.name] = remark("no_measured_pressure")
-            continue
-        if absent := [
-            column for column in effect.needs if not any(stated(column, trial_data.trial) for trial_data in data)
-        ]:
-            reasons[effect.name] = remark(COLUMN_BLANK, column=absent[0])
-            continue
-        try:
-            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
-        except EffectError:
-            reasons[effect.name] = remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
-            continue
-        can_act.append(effect)
-    return tuple(can_act), reasons
+    """Candidates that these trials can test, and the reason why not by name of each of the others."""
+    reasons = {effect.name: why for effect in candidates if (why := _untestable(effect, data))}
+    return tuple(effect for effect in candidates if effect.name not in reasons), reasons
+
+
+def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
+    """The reason why these trials cannot test an effect; blank where they can."""
+    trials, has_trace = [trial_data.trial for trial_data in data], [trial_data.trace is not None for trial_data in data]
+    of_tube = [column for column in effect.needs if column in ("chamber_l", "inlet_mm", "yield_pressure_kPa")]
+    if of_tube and all(trial.travel_ratio == 1 for trial in trials):
+        return remark("no_tube", column=of_tube[0])
+    if effect.in_trace and all(has_trace):
+        return remark("in_measured_pressure")
+    if "trace_time" in effect.functions and not any(has_trace):
+        return remark("no_measured_pressure")
+    if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
+        return remark(COLUMN_BLANK, column=absent[0])
+    try:
+        check_needs(Model((effect,)), *trials)
+    except EffectError:
+        return remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
+    return Remark()
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
@@ -502,9 +493,9 @@ def levers_of(fit: Fit, products: Products) -> Floats:
     return np.asarray(projected(fit, products, fit.state).lever[: len(free)] * np.array(derivatives)[:, None])
 
 
-def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
-    """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`."""
-    projection = projected(fit, products, state or fit.state)
+def scores_of(fit: Fit, products: Products) -> Scores:
+    """Compute the scores at a fit."""
+    projection = projected(fit, products, fit.state)
     blocks, places, p = projection.blocks, products.problem.index, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
