@@ -165,10 +165,10 @@ def _separations(rises: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(np.nansum(rises, axis=0) / count, 0.0)))
 
 
-def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
-    """The smaller separation of the two directions, by pair."""
-    pairs = itertools.combinations(range(len(separations)), 2)
-    return {(a, b): float(min(separations[a, b], separations[b, a])) for a, b in pairs}
+def _smaller(between: Floats) -> Floats:
+    """The smaller separation of the two directions of every pair. Shapes: between (…, n, n) → (…, n_pairs)."""
+    first, second = np.triu_indices(between.shape[-1], 1)
+    return np.minimum(between[..., first, second], between[..., second, first])
 
 
 @in_one_blas_thread
@@ -230,12 +230,11 @@ def _designs_of(tied: Sequence[Fit], extended: Sequence[Fit]) -> list[Designs]:
 
 def worth(between: Floats) -> Floats:
     """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions
-    (T-optimality). Shapes: between (n_designs, n, n), in standard deviations → (n_designs,).
+    (T-optimality). Shapes: between (…, n, n), in standard deviations → (…).
     """
-    first, second = np.triu_indices(between.shape[1], 1)
-    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
+    square = _smaller(between) ** 2
     # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
-    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
+    return np.asarray(np.sum(square / (square + 5.0**2), axis=-1))
 
 
 def _best_option(
@@ -266,9 +265,9 @@ def _best_option(
             options.append((trials, simulated_rises(tied, trials, [0], seed)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
-            if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
+            if _smaller(_separations(options[-1][1])).min() >= 8.0:
                 return options[-1]
-    return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
+    return max(options, key=lambda option: float(worth(_separations(option[1]))))
 
 
 def _recommendation(
@@ -276,7 +275,7 @@ def _recommendation(
 ) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
     between = _separations(np.concatenate([rises, simulated_rises(fits, design, [1], seed)]))
-    expected = _by_pair(between)
+    expected = dict(zip(itertools.combinations(range(len(fits)), 2), _smaller(between).tolist(), strict=True))
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
     worth_it = len(unresolved) < len(expected)

@@ -496,21 +496,19 @@ def levers_of(fit: Fit, products: Products) -> Floats:
 def scores_of(fit: Fit, products: Products) -> Scores:
     """Compute the scores at a fit."""
     projection = projected(fit, products, fit.state)
-    blocks, places, p = projection.blocks, products.problem.index, products.n_unknowns
+    count, p = products.n_shapes, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
     # the scatter of trials: the residuals are those of the fit.
-    none = np.zeros((1, products.n_shapes))
-    lever, lever_of_fit = np.vstack([projection.lever, none]), np.vstack([projection.lever_of_fit, none])
+    lever, lever_of_fit = np.pad(projection.lever, ((0, 1), (0, 0))), np.pad(projection.lever_of_fit, ((0, 1), (0, 0)))
     step = np.append(projection.step_of_fit, 0.0)
-    trial_scores = np.empty((len(blocks), products.n_shapes))
-    trial_informations = np.empty((len(blocks), products.n_shapes, products.n_shapes))
-    for part in products.parts:
-        of_part, lever_of_part, moved = blocks[part], lever[places[part]], lever_of_fit[places[part]]
-        residual = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[places[part]])
-        trial_scores[part] = residual[:, C] - np.einsum("nk,nks->ns", residual[:, X], lever_of_part)
-        trial_informations[part] = of_part[:, C, C] - of_part[:, C, X] @ moved
-        trial_informations[part] -= np.swapaxes(lever_of_part, 1, 2) @ (of_part[:, X, C] - of_part[:, X, X] @ moved)
+    trials = len(projection.blocks)
+    trial_scores, trial_informations = np.empty((trials, count)), np.empty((trials, count, count))
+    for i, (block, places) in enumerate(zip(projection.blocks, products.problem.index, strict=True)):
+        moved, own = lever_of_fit[places], lever[places]
+        residual = block[:, r] - block[:, X] @ step[places]
+        trial_scores[i] = residual[C] - residual[X] @ own
+        trial_informations[i] = block[C, C] - block[C, X] @ moved - own.T @ (block[X, C] - block[X, X] @ moved)
     trial_scores[:, projection.empty] = 0.0
     groups = coarsest_groups([trial.trial for trial in fit.trials])
     return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)
