@@ -80,29 +80,29 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
         return []
     stated_Pa = [trial_data.typical_pressure_Pa for trial_data in data]
     force_N = np.array([_force_N(*pair) for pair in zip(trials, stated_Pa, strict=True)])
-    driven = force_N > 0
     of_vine = np.array([trial.vine for trial in trials])
-    vines = np.unique(of_vine[driven])
+    vines = np.unique(of_vine)
     # 2: slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
-    remaining = int(np.count_nonzero(driven)) - vines.size - 2
-    if np.count_nonzero(driven) < FEWEST_TRIALS or remaining < 1:
+    remaining = len(data) - vines.size - 2
+    if remaining < 1:
         return []
-    log_force, log_speed = np.log(force_N[driven]), np.log([middle_speed(trial_data) for trial_data in data])
-    log_speed -= np.median(log_speed[driven])
+    # A trial that its stated force could not move lies far off every curve.
+    log_force = np.log(np.maximum(force_N, 1e-9))
+    log_speed = np.log([middle_speed(trial_data) for trial_data in data])
+    log_speed -= np.median(log_speed)
     curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
     usual_exponent = 0.37  # Starting value of the exponent (PHYSICS)
-    straight = log_force - usual_exponent * log_speed[driven]
-    levels = [float(np.median(straight[of_vine[driven] == vine])) for vine in vines]
+    straight = log_force - usual_exponent * log_speed
+    levels = [float(np.median(straight[of_vine == vine])) for vine in vines]
     # 0.05: residual of ln F at which the robust fit (Cauchy loss) halves the weight of a trial (chosen)
     fitted = least_squares(
-        lambda values: log_force - curves[driven] @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
+        lambda values: log_force - curves @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
     )
-    residual = np.full(len(data), -np.inf)
-    residual[driven] = log_force - curves[driven] @ fitted.x
+    residual = log_force - curves @ fitted.x
     # Fitted curves follow the trials: the scatter about them is smaller by the degrees of freedom that they take.
-    median_deviation = float(np.median(np.abs(residual[driven]))) / 0.6745
+    median_deviation = float(np.median(np.abs(residual))) / 0.6745
     # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
-    scatter = max(median_deviation * math.sqrt(np.count_nonzero(driven) / remaining), 0.02)
+    scatter = max(median_deviation * math.sqrt(len(data) / remaining), 0.02)
     # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
     # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
     allowed = scatter * float(student.isf(CHANCE / (2 * len(data)), max(0.37 * remaining + 1.0, 3.0)))
@@ -117,11 +117,10 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     # 0.125: the largest fraction that may be outliers (chosen)
     if len(odd) > max(2, int(0.125 * len(data))):
         return []
-    expected_N = np.where(np.isin(of_vine, vines), np.exp(curves @ fitted.x), math.nan)
-    implied_Pa = [stated_Pa[k] + (expected_N[k] - force_N[k]) / trials[k].area_m2 for k in odd]
+    lacking_Pa = [(np.exp(curves[k] @ fitted.x) - force_N[k]) / trials[k].area_m2 for k in odd]
     return [
-        OddTrial(trials[k].name, stated_Pa[k], float(Pa), trials[k].pressure_unit)
-        for k, Pa in zip(odd, implied_Pa, strict=True)
+        OddTrial(trials[k].name, stated_Pa[k], stated_Pa[k] + float(lacks), trials[k].pressure_unit)
+        for k, lacks in zip(odd, lacking_Pa, strict=True)
     ]
 
 
