@@ -172,7 +172,7 @@ def _smaller(between: Floats) -> Floats:
 
 
 @in_one_blas_thread
-def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
+def next_experiment(tied: Sequence[Fit], limits: Limits | None = None) -> NextExperiment:
     """Recommend trials that separate hypotheses which fit the same trials equally well."""
     limits = limits or Limits()
     if len(tied) < 2:
@@ -197,8 +197,8 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
         designs = _designs_of(tied, [extended_fit(fit, films) for fit in tied])
     except SimulationError as error:
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
-    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits, seed)
-    return _recommendation(tied, names, design, rises, seed)
+    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits)
+    return _recommendation(tied, names, design, rises)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -238,7 +238,7 @@ def worth(between: Floats) -> Floats:
 
 
 def _best_option(
-    tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits, seed: int
+    tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits
 ) -> tuple[list[Condition], Floats]:
     """The best set of trials of the least effort that is sufficient, else of all. Returns design, rises (see
     `simulated_rises`).
@@ -262,19 +262,19 @@ def _best_option(
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
             before, trials = predicted, [conditions[k] for k in design]
-            options.append((trials, simulated_rises(tied, trials, [0], seed)))
+            options.append((trials, simulated_rises(tied, trials, 0)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
-            if _smaller(_separations(options[-1][1])).min() >= 8.0:
+            if _smaller(_separations(options[-1][1][None])).min() >= 8.0:
                 return options[-1]
-    return max(options, key=lambda option: float(worth(_separations(option[1]))))
+    return max(options, key=lambda option: float(worth(_separations(option[1][None]))))
 
 
 def _recommendation(
-    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats, seed: int
+    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats
 ) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    between = _separations(np.concatenate([rises, simulated_rises(fits, design, [1], seed)]))
+    between = _separations(np.stack([rises, simulated_rises(fits, design, 1)]))
     expected = dict(zip(itertools.combinations(range(len(fits)), 2), _smaller(between).tolist(), strict=True))
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
@@ -321,25 +321,25 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 # explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
 
 
-def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draws: Sequence[int], seed: int) -> Floats:
+def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draw: int) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
-    average. Shape (n_draws, n, n).
+    average. Shape (n, n).
     """
     n = len(tied)
     # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
     alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    rises = np.full((len(draws), n, n), math.nan)
+    rises = np.full((n, n), math.nan)
     before = np.array([-2 * fit.log_likelihood for fit in tied])
-    for k, a in np.ndindex(len(draws), n):
-        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * tied[a].solution.state.spread
+    for a, truth in enumerate(tied):
+        deviations = alternating[(np.arange(len(design)) + draw) % 4] * truth.solution.state.spread
         try:
-            films = _noisy_films(tied[a], design, deviations, np.random.default_rng([seed, 0, draws[k], a]))
+            films = _noisy_films(truth, design, deviations, np.random.default_rng([0, 0, draw, a]))
         except SimulationError:
             continue
         if films:
             after = np.array([_refitted(fit, films) for fit in tied])
-            rises[k, a] = after - before - (after[a] - before[a])
+            rises[a] = after - before - (after[a] - before[a])
     return rises
 
 

@@ -45,6 +45,8 @@ from vinetrack.inference.sensitivity import position_change
 
 NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
+REACH_SIGMAS = 3.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
+
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
 
@@ -166,27 +168,23 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     return tuple((low + fraction * (high - low)) for fraction in (0.15, 0.5, 0.85))
 
 
-def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0) -> tuple[float, str] | None:
-    """Find the common slip in the sheet that would produce a fitted size, up to an ordinary error. Returns (float, str)
-    or None: Size that the slip produces, and what was done; None where no slip fits.
+def slip_of(parameter: Parameter, value: float, sigma: float) -> tuple[float, str] | None:
+    """The size that a common slip in the sheet produces, and what was done, where a fitted size is that up to an
+    ordinary error; None where no slip fits.
     """
     if parameter.plausible is None:
         return None
     low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
     for size, action in parameter.slips:
-        remaining, margin = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
+        remaining, margin = (1 + value) / (1 + size) - 1, REACH_SIGMAS * sigma / (1 + size)
         if low - margin <= remaining <= high + margin:
             return size, action
     return None
 
 
-def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, within `reach` standard errors of it, or is that of a slip."""
-    if (
-        parameter.plausible is None
-        or value == parameter.zero
-        or slip_of(parameter, value, sigma, reach=reach) is not None
-    ):
+def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: float = 1.0) -> bool:
+    """Whether a value lies in the plausible range, within its error of it, or is that of a slip."""
+    if parameter.plausible is None or value == parameter.zero or slip_of(parameter, value, sigma) is not None:
         return True
     low, high = parameter.plausible
     if math.isfinite(parameter.period):
@@ -195,7 +193,7 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
         # 3.0: factor by which a size may lie below a range that is not narrow (chosen)
         low /= 3.0
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
-    margin = reach * sigma if math.isfinite(sigma) else math.inf
+    margin = REACH_SIGMAS * sigma if math.isfinite(sigma) else math.inf
     return bool(low - margin <= value <= high + margin)
 
 
