@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Kinematics, Track
+from vinetrack.core.records import Kinematics, Track
 from vinetrack.core.terminal import plot
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import (
+    AlignedTrials,
     Replicates,
     by_condition,
     expected_error,
@@ -33,9 +34,8 @@ from vinetrack.diagnosis.replicates import (
 )
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
-from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.fit import fit, fit_subset, predict_prepared, prepared_pairs
+from vinetrack.inference.fit import fit, fit_subset, predict_prepared
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import Predictor
@@ -136,14 +136,10 @@ def compare(
     """Compare a fitted model with the trials of an experiment."""
     import pandas as pd
 
-    fitted = {trial.name for trial in fit.trials}
-    chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
-    courses, _ = residual_courses(fit)
+    courses, predicted, aligned = residual_courses(fit)
     scatter, of_condition = replicate_scatter(fit, courses), by_condition(courses)
-    predicted = predict_prepared(fit, prepared_pairs(chosen), from_rest=True)
-    final = _final_speed_errors(
-        fit, predicted, {trial.name: track for trial, track in chosen}, kinematics or {}, final_at_fraction
-    )
+    measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
+    final = _final_speed_errors(aligned, predicted, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
     for condition, together in replicates_by_condition(predicted).items():
         known = [final[trial.name] for trial in together.trials if math.isfinite(final[trial.name])]
@@ -188,7 +184,7 @@ def position_errors(together: Replicates) -> dict[str, float]:
 
 
 def _final_speed_errors(
-    fit: Fit,
+    aligned: AlignedTrials,
     predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
     kinematics: Mapping[str, Kinematics],
@@ -199,11 +195,10 @@ def _final_speed_errors(
     """
     # 3.0: duration of the simulation, in durations of the recording, so that a slow model reaches the same
     # position (chosen)
-    times = [3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
-    traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
-    runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces, host=fit.predictor.host)
+    times_s = [t.release_s + 3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    runs = aligned.predictor.run(aligned.predictor.jobs(np.empty(0), aligned.trial_effects), times_s)
     errors = {}
-    for trial, time_s, run in zip(predicted, times, runs, strict=True):
+    for trial, time_s, run in zip(predicted, times_s, runs, strict=True):
         motion = kinematics.get(trial.name) or estimate_kinematics(
             tracks[trial.name], travel_ratio=trial.trial.travel_ratio
         )
@@ -215,13 +210,6 @@ def _final_speed_errors(
         by_model = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
         errors[trial.name] = (by_model if math.isfinite(by_model) else 0.0) - measured
     return errors
-
-
-def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats] | None:
-    if track.pressure_Pa is None:
-        return None
-    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-    return track.time_s[known] - release_s, track.pressure_Pa[known]
 
 
 # ------------------------------------------------------------------------------
@@ -273,7 +261,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
     floor_m = inside[0].floor_m
-    courses, _ = residual_courses(fits[0])
+    courses, *_ = residual_courses(fits[0])
     expected = expected_error(courses, replicate_scatter(fits[0], courses))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)

@@ -84,7 +84,7 @@ def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails."""
     import pandas as pd
 
-    courses, predicted = residual_courses(fit)
+    courses, predicted, _ = residual_courses(fit)
     scatter, together = replicate_scatter(fit, courses), replicates_by_condition(predicted)
     conditions = by_condition(courses)
     rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in conditions.items()]

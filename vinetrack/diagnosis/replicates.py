@@ -343,11 +343,11 @@ class ResidualCourse:
         return np.asarray(np.diag(self.noise_m2 / np.maximum(count, 1.0)) + self.origin_m2)
 
 
-def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit]]:
+def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit], AlignedTrials]:
     """Courses of the trials of a fit, and the trials as predicted with their own release and origin."""
     predicted = predict_prepared(fit, list(map(as_recorded, fit.predictor.data)), from_rest=True)
     aligned = align_trials(fit)
-    return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted
+    return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted, aligned
 
 
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
