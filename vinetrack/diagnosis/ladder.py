@@ -321,29 +321,15 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     data = [as_recorded(trial_data) for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         others = fit_subset(
-            fit,
-            [not out for out in gone],
-            hold_spreads=True,
-            hold_noise=True,
-            most_iterations=MOST_ITERATIONS,
+            fit, [not out for out in gone], hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
         )
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
-    undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
-    undetermined &= {number.vine for number in fit.numbers if number.key in fit.model.parameter_names}
-    not_predicted = {
-        trial_data.trial.name: remark("undetermined_vine", vine=trial_data.trial.vine)
-        for trial_data in data
-        if trial_data.trial.vine in undetermined
-    }
-    predictable = [trial_data for trial_data in data if trial_data.trial.name not in not_predicted]
-    return _combined([_predicted(others, predictable), Errors((), not_predicted)])
+    return _predicted(others, data)
 
 
 def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
-    """Predictions of trials; where the simulation of a trial fails, the reason instead."""
-    if not data:
-        return Errors((), {})
+    """Predictions of trials, or why one cannot be predicted: the fit lacks its parameters, or its simulation fails."""
     try:
         return Errors(tuple(predict_prepared(fit, data, from_rest=True)), {})
     except FitError as error:

@@ -297,10 +297,7 @@ class AlignedTrials:
 def align_trials(fit: Fit) -> AlignedTrials:
     """Align the model with the trials that it was fitted to, by release and origin."""
     predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
-    try:
-        return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
+    return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
 
 
 def orthogonal_part(columns: Floats, others: Floats) -> Floats:

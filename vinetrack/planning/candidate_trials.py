@@ -317,8 +317,6 @@ def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> list[tup
     """Job and trajectory of trials that are released at time and position 0, as the fit predicts them; None for those
     that cannot be simulated, found by bisection.
     """
-    if not blanks:
-        return []
     predictor, _, state = extended(fit, blanks)
     state.trial_effects[len(fit.trials) :] = 0.0
     jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
