@@ -420,14 +420,10 @@ class Scatter:
 
     def covariance(self, response_m: Floats, noise_m2: Floats) -> Floats:
         """Covariance of the means of one trial's stretches, m². Shapes: response_m (n, 2), noise_m2 (n, n) → (n, n)."""
-        return _covariance(response_m, noise_m2, np.array([self.pressure, self.damping, self.residual]) ** 2)
-
-
-def _covariance(response_m: Floats, noise_m2: Floats, variances: Floats) -> Floats:
-    shared = (response_m * variances[:2]) @ response_m.T
-    residual = variances[2] * float(np.trace(shared)) / len(shared)
-    # 1e-6: lower limit of the error of a stretch mean, m (chosen)
-    return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
+        shared = response_m * (self.pressure**2, self.damping**2) @ response_m.T
+        residual = self.residual**2 * float(np.trace(shared)) / len(shared)
+        # 1e-6: lower limit of the error of a stretch mean, m (chosen)
+        return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 
 
 def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
@@ -443,20 +439,20 @@ def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
         return Scatter(spreads[0], spreads[1], start_values[2], 0)
     deviations = [group.means_m - group.means_m.mean(axis=0) for group in groups]
 
+    def scatter(logs: Floats) -> Scatter:
+        pressure, damping, residual = np.exp(np.clip(logs, lower_bounds, upper_bounds)).tolist()
+        return Scatter(pressure, damping, residual, dof)
+
     def minus_two_log_likelihood(logs: Floats) -> float:
         total = 0.0
         for group, deviation_m in zip(groups, deviations, strict=True):
-            variances = np.exp(2 * np.clip(logs, lower_bounds, upper_bounds))
-            covariance = _covariance(group.response_m, group.noise_m2, variances)
+            covariance = scatter(logs).covariance(group.response_m, group.noise_m2)
             total += (len(deviation_m) - 1) * float(np.linalg.slogdet(covariance)[1])
             total += float(np.sum(deviation_m * np.linalg.solve(covariance, deviation_m.T).T))
         return total
 
-    best = minimize(
-        minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
-    )
-    pressure, damping, residual = np.exp(np.clip(best.x, lower_bounds, upper_bounds)).tolist()
-    return Scatter(pressure, damping, residual, dof)
+    how = {"xatol": 0.02, "fatol": 0.01}
+    return scatter(minimize(minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options=how).x)
 
 
 def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
