@@ -55,11 +55,10 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     fastest = max(
         trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in fit.trials
     )
-    lengths = [trial.trial.length_m for trial in fit.trials]
-    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in fit.trials]
+    # As a part of the length where that is known
     reach = max(
-        grown / length if math.isfinite(length) and length > 0 else grown
-        for grown, length in zip(reaches, lengths, strict=True)
+        float(np.max(trial.lead_position_m) - trial.origin_m) / (np.nan_to_num(trial.trial.length_m) or 1.0)
+        for trial in fit.trials
     )
     varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
     shapes = []
@@ -188,13 +187,12 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     """
     from scipy.stats import f
 
-    names = sorted(set(groups))
-    members = [values[[group == name for group in groups]] for name in names]
-    within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
-    inner, outer = values.size - len(names), len(names) - fitted
+    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
+    mean = np.bincount(group, values) / count
+    inner, outer = values.size - count.size, count.size - fitted
     if inner < MIN_REPLICATE_DEGREES or outer < 1:
         return math.nan
-    between = sum(member.size * float(member.mean()) ** 2 for member in members)
+    within, between = float(np.sum((values - mean[group]) ** 2)), float(np.sum(count * mean**2))
     if not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
