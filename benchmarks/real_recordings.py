@@ -12,14 +12,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 from tube.folder import write_folder
 from tube.models import models
 from tube.recordings import read_recordings
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.ladder import rms_of
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import Number, TrialFit
 from vinetrack.video.track import track_recording
@@ -36,7 +35,7 @@ def sized(number: Number) -> str:
 
 def rms_mm(trial: TrialFit) -> float:
     """Root mean square of what is missed from where something moves, mm."""
-    return 1e3 * float(np.sqrt(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)))
+    return 1e3 * rms_of([trial])
 
 
 def cups() -> None:

@@ -13,7 +13,7 @@ import vinetrack as vt
 from tube.recordings import AREA_M2, Recording
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.ladder import in_sample, left_out
-from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.ladder import rms_of as rms_m
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit_data import pairs_of
@@ -146,11 +146,6 @@ def _best(
     if not followed:
         raise vt.FitError(f"{name}: no start could be followed.")
     return min(followed, key=lambda pair: rms_m(pair[1]))
-
-
-def rms_m(trials: Sequence[TrialFit]) -> float:
-    """Root mean square of the position error from where something moves, every trial alike, m."""
-    return math.sqrt(float(np.mean([np.mean(trial.residual_m[first_that_counts(trial) :] ** 2) for trial in trials])))
 
 
 def number(fit: Fit, key: str) -> float:

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import grown as campaigns
 import numpy as np
@@ -24,7 +23,6 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference import systematics
 from vinetrack.inference.optimiser import relative_residual
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
-from vinetrack.tracks.position_noise import ar1_noise
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
 
@@ -140,7 +138,7 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
         assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
 
 
-WANDER_M, B = 2e-4, "eversion_damping.B"
+B = "eversion_damping.B"
 
 
 def fitted(pairs: Pairs):
@@ -158,25 +156,14 @@ def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials=(
     return pairs
 
 
-def wandering(*, at_rest: bool) -> Pairs:
-    draw, spoilt = np.random.default_rng(3), []
-    for trial, track in grown(seed=31):
-        wander_m = ar1_noise(track.time_s.size, WANDER_M, 0.9, draw)
-        moves = track.lead_position_m > track.lead_position_m[:5].mean() + 2e-3
-        wander_m[: int(np.argmax(moves))] *= at_rest
-        spoilt.append((trial, replace(track, lead_position_m=track.lead_position_m + wander_m)))
-    return spoilt
-
-
 def test_replicates_that_deviate_together_are_seen():
     assert questions.between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
 @pytest.mark.slow
-def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none():
+def test_replicates_that_scatter_are_none():
     complete = [fitted(grown(seed=seed)) for seed in (32, 33, 34)]
     assert all(questions.between_conditions_p(fit) > 0.05 for fit in complete)
-    assert all(questions.noise_in_motion_p(fit) > 1e-2 for fit in [*complete, fitted(wandering(at_rest=True))])
 
 
 def test_a_scatter_that_replicates_have_too_is_none_of_the_model():
@@ -206,32 +193,6 @@ def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model()
         for k, trial in enumerate(50 * fit.trials)
     ]
     assert not questions.has_excess_scatter(replace(fit, trials=tuple(trials)))
-
-
-def test_what_is_louder_in_motion_than_at_rest_is_heard_where_positions_do_not_come_from_a_film():
-    spoilt = wandering(at_rest=False)
-    assert questions.noise_in_motion_p(fitted(spoilt)) < 1e-5
-    filmed = [
-        (replace(t, video=Path("filmed.mp4")), replace(x, lead_position_systematic_m=np.full(x.time_s.size, 1e-4)))
-        for t, x in spoilt
-    ]
-    assert questions.noise_in_motion_p(fitted(filmed)) == 1.0
-
-
-@pytest.mark.parametrize(("heavy", "most"), [(False, 0.02), (True, 0.04)])
-def test_heavy_tails_alone_are_not_louder_in_motion(heavy, most):
-    """600 campaigns in which nothing differs: few alarms at 1 %, also where single stretches are far louder."""
-    draw, alarms = np.random.default_rng(20732), 0
-    for _ in range(600):
-        white = draw.standard_normal((12, 16, questions.STRETCH_FRAMES))
-        if heavy:
-            white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
-        trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
-        seen = {"slow_m": None, "gauge_error": 0.0, "noise_m": 1e-4, "lead_position_m": np.array([0.0, 0.3])}
-        data = SimpleNamespace(n_rest=8 * questions.STRETCH_FRAMES, **seen)
-        fit = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
-        alarms += questions.noise_in_motion_p(fit) < 0.01
-    assert alarms / 600 < most
 
 
 LATCH, OFF = ({"latch_release.F": F, "latch_release.reach": reach} for F, reach in ((0.6, 0.015), (0.3, 0.01)))

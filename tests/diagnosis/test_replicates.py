@@ -13,7 +13,7 @@ import vinetrack as vt
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
-from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors, trajectory_table
+from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors
 from vinetrack.diagnosis.replicates import OddTrial, odd_trials, replicates_of, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import prepare
@@ -78,7 +78,7 @@ def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_tria
 
 def test_the_band_is_that_of_the_replicates():
     trials = [by_hand("a", np.full(100, 1e-3)), by_hand("b", np.full(100, -1e-3))]
-    table = trajectory_table(replicates_of(trials))
+    table = replicates_of(trials).frames
     last = table[table["trial"] == "a"].iloc[-1]
     columns = ["model_position_m", "replicates_mean_m", "lead_position_m"]
     assert last[columns].tolist() == pytest.approx([SPEED_M_S * 0.1, SPEED_M_S * 0.1, SPEED_M_S * 0.1 + 1e-3])

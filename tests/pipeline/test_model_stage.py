@@ -14,7 +14,6 @@ from lsoda_vine import small_campaign
 from test_pipeline import MODEL_HEADERS
 
 from vinetrack.core.records import Track, Trial, plain_track
-from vinetrack.diagnosis.campaign_power import SimulatedDiagnosis
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.registry import figures_of
@@ -189,9 +188,9 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder, 
 def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypatch):
     asked_for: list[tuple[str, int]] = []
 
-    def answered(_tests: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
+    def answered(_tests: object, effect: str, _values: object, seed: int) -> tuple[str, bool]:
         asked_for.append((effect, seed))
-        return SimulatedDiagnosis("leak", True) if effect and seed % 2 else SimulatedDiagnosis()
+        return ("leak", True) if effect and seed % 2 else ("", False)
 
     monkeypatch.setattr(planning_stage, "simulated_diagnosis", answered)
     nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated

@@ -12,7 +12,6 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -102,17 +101,11 @@ def filmed_again(
     return tracks_of(predictor, replace(state, trial_effects=trial_effects), jobs, draw, recorded_s, model)
 
 
-class SimulatedDiagnosis(NamedTuple):
-    """What the diagnosis of one simulated campaign named, blank for nothing; whether the effect was among it or was
-    added later; and the reason why there is no verdict.
-    """
-
-    named: str = ""
-    found: bool = False
-    failed: str = ""
+# What a diagnosis named, blank for nothing, and whether the effect was among it or was added later; None for no verdict
+Outcome = tuple[str, bool] | None
 
 
-def simulated_diagnosis(tests: MisfitTests, effect: str, values: Sequence[float], seed: int) -> SimulatedDiagnosis:
+def simulated_diagnosis(tests: MisfitTests, effect: str, values: Sequence[float], seed: int) -> Outcome:
     """Simulate one campaign like that of the tests, with an effect of these values unless it is blank, and diagnose it
     in full.
     """
@@ -125,25 +118,23 @@ def simulated_diagnosis(tests: MisfitTests, effect: str, values: Sequence[float]
                 pairs, model=make_model(model.names, model.user_effects), candidates=candidates, ladder=False,
                 advice=False, user_effects=model.user_effects,
             )  # fmt: skip
-    except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
-        return SimulatedDiagnosis(failed=f"{type(error).__name__}: {error}")
-    if diagnosis.verdict == ADEQUATE:
-        return SimulatedDiagnosis()
-    named = " or ".join(diagnosis.answer_set) or diagnosis.verdict
-    return SimulatedDiagnosis(named, effect in (*diagnosis.answer_set, *diagnosis.effects))
+    except (FitError, SimulationError, EffectError, np.linalg.LinAlgError):
+        return None
+    named = "" if diagnosis.verdict == ADEQUATE else " or ".join(diagnosis.answer_set) or diagnosis.verdict
+    return named, effect in (*diagnosis.answer_set, *diagnosis.effects)
 
 
-def rates_of(effect: str, diagnoses: Sequence[SimulatedDiagnosis], value: float, promised: float) -> SimulatedRates:
+def rates_of(effect: str, outcomes: Sequence[Outcome], value: float, promised: float) -> SimulatedRates:
     """Count the outcomes of campaigns with one effect, of this size; with none where it is blank."""
-    named = Counter(diagnosis.named for diagnosis in diagnoses if diagnosis.named)
-    failed = sum(bool(diagnosis.failed) for diagnosis in diagnoses)
+    known = [outcome for outcome in outcomes if outcome is not None]
+    named = Counter(name for name, _ in known if name)
     return SimulatedRates(
         effect=effect,
         value=value,
         promised=promised,
         alarms=named.total(),
-        count=sum(diagnosis.found for diagnosis in diagnoses) if effect else named.total(),
-        campaigns=len(diagnoses) - failed,
+        count=sum(found for _, found in known) if effect else named.total(),
+        campaigns=len(known),
         named=tuple(named.most_common()),
-        failed=failed,
+        failed=len(outcomes) - len(known),
     )

@@ -21,14 +21,7 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.replicates import (
-    dropped_frames_in,
-    lost_frames,
-    odd_trials,
-    with_lost_frames,
-    with_odd_trials,
-)
+from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -80,35 +73,33 @@ def diagnose(
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
-    outliers_note = ""
     if isinstance(source, Fit):
-        effects = candidates_of(source.model, candidates, user_effects)
-        fit, dropped = with_host(source, host_for(source.model, effects)), dropped_frames_in(source)
+        fitted, model, source = source, source.model, source.pairs
+    settings = _settings(source)
+    if settings is not None:
+        source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
+        model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
+        candidates = stated_candidates if candidates is None else candidates
+        limits = limits or stated_limits
+    model = model or base_model()
+    effects = candidates_of(model, candidates, user_effects)
+    pairs, left_out = pairs_of(source, tracks)
+    if settings is None:  # the tracks of an experiment were corrected as they were read
+        pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
+    dropped = lost_frames(pairs)
+    outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
+    report("fitting the model")
+    if fitted is None or dropped:
+        fit = initial_fit(model, pairs, effects, profile=False)
     else:
-        settings = _settings(source)
-        if settings is not None:
-            source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
-            model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
-            candidates = stated_candidates if candidates is None else candidates
-            limits = limits or stated_limits
-        model = model or base_model()
-        effects = candidates_of(model, candidates, user_effects)
-        pairs, left_out = pairs_of(source, tracks)
-        if settings is None:  # the tracks of an experiment were corrected as they were read
-            pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
-        dropped = lost_frames((trial.name, track) for trial, track in pairs)
-        outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
-        report("fitting the model")
-        fit = fitted if fitted is not None and not dropped else initial_fit(model, pairs, effects, profile=False)
-        fit = replace(fit, left_out={**left_out, **fit.left_out})
-    result = _diagnosis_of(fit, effects, report)
-    if not isinstance(source, Fit):
+        fit = with_host(fitted, host_for(model, effects))
+    fit = replace(fit, left_out={**left_out, **fit.left_out})
 
-        def without(names: Sequence[str]) -> Diagnosis:
-            remaining = [pair for pair in pairs if pair[0].name not in names]
-            return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
+    def without(names: Sequence[str]) -> Diagnosis:
+        remaining = [pair for pair in pairs if pair[0].name not in names]
+        return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
 
-        result = with_odd_trials(result, odd_trials(fit.predictor.data), without)
+    result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
     result = with_lost_frames(result, dropped)
     if outliers_note:
         result = replace(result, notes=(*result.notes, outliers_note))
@@ -124,9 +115,21 @@ def diagnose(
 
 
 def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Diagnosis:
-    """Select the effects that a fit lacks among these candidates, and report the rounds."""
+    """Select the effects that a fit lacks among these candidates, and tell the rounds in words and tables."""
     effects, not_testable = testable(candidates, fit.predictor.data)
-    return _to_diagnosis(fit, select_effects(fit, effects, report), not_testable)
+    steps = select_effects(fit, effects, report)
+    rounds = tuple(_to_round(step, not_testable) for step in steps)
+    explanation = " ".join(finished.explanation for finished in rounds)
+    lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
+    if lack_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
+        explanation += " " + str(remark("not_tried", names=lack_columns))
+    return Diagnosis(
+        rounds=rounds,
+        effects=tuple(step.answer_names[0] for step in steps[:-1]),
+        explanation=explanation,
+        fits=(fit, *(step.tests.fit for step in steps[1:])),
+        power=power_of(steps[-1].tests, not_testable),
+    )
 
 
 def _settings(
@@ -145,44 +148,30 @@ def _settings(
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
-def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mapping[str, Remark]) -> Diagnosis:
-    """Selection steps in words and tables."""
-    rounds = tuple(_to_round(step, not_testable) for step in steps)
-    added = tuple(step.answer_names[0] for step in steps[:-1])
-    fits = (fit, *(step.tests.fit for step in steps[1:]))
-    explanation = " ".join(finished.explanation for finished in rounds)
-    lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
-    if lack_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
-        explanation += " " + str(remark("not_tried", names=lack_columns))
-    power = power_of(steps[-1].tests, not_testable)
-    return Diagnosis(rounds=rounds, effects=added, explanation=explanation, fits=fits, power=power)
-
-
 def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     tests = step.tests
+    names = tuple(dict.fromkeys(tests.sensitivities.effects))
+    # Between effects, each in the shape of the largest predicted gain
+    best_shapes = [tests.ranked_shapes(name)[0] for name in names]
+    cosines = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
+    sets = tuple(hypothesis.names for hypothesis in step.answer_set)
     return Round(
         model=tests.fit.model.names,
         verdict=step.verdict,
         answer_set=step.answer_names,
         ranking=tuple(_ranking(step, not_testable)),
         explanation=in_words(step),
-        cosines=_cosines(tests),
+        cosines=Cosines(names, cosines.tolist()),
         fit=tests.fit,
         fits={
             hypothesis.names[-1]: hypothesis.fit
             for hypothesis in step.answer_set
             if hypothesis.effects[-1].kind != BETWEEN_TRIALS
         },
-        sets=_sets(step),
+        sets=sets if any(len(effects) > 1 for effects in sets) else (),
         partial=_partial_candidates(step),
         partial_fits=tuple(hypothesis.fit for hypothesis in step.partial),
     )
-
-
-def _sets(step: SelectionStep) -> tuple[tuple[str, ...], ...]:
-    """Effects of each hypothesis of the answer set; empty where every hypothesis has one effect."""
-    sets = tuple(hypothesis.names for hypothesis in step.answer_set)
-    return sets if any(len(names) > 1 for names in sets) else ()
 
 
 def _refitted(hypothesis: LikelihoodRatio, effect: Effect, **more: Any) -> Candidate:
@@ -199,14 +188,6 @@ def _partial_candidates(step: SelectionStep) -> tuple[Candidate, ...]:
         candidates.append(_refitted(likelihood_ratio(before, (effect,), hypothesis.fit), effect))
         before = hypothesis.fit
     return tuple(candidates)
-
-
-def _cosines(tests: MisfitTests) -> Cosines:
-    """Cosines between effects, each in the shape of the largest predicted gain."""
-    names = tuple(dict.fromkeys(tests.sensitivities.effects))
-    best_shapes = [tests.ranked_shapes(name)[0] for name in names]
-    matrix = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
-    return Cosines(names, matrix.tolist())
 
 
 def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Candidate]:
@@ -240,6 +221,8 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
         else:
+            # An effect that contains one of the answer set can fit no worse, and need not be fitted.
+            contained = [answer for answer in effect.replaces if answer in step.answer_names]
             row = Candidate(
                 effect.name,
                 effect.kind,
@@ -248,7 +231,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
                 z,
                 tests.predicted_size(effect, shape),
                 in_answer_set=effect.name in step.answer_names,
-                reason=_contains_answer(effect, step),
+                reason=remark(CONTAINS, name=contained[0]) if contained else Remark(),
                 largest={} if tests.poorly_fitted else upper_limits,
             )
             rows.append(row)
@@ -267,12 +250,6 @@ def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:
     if step.verdict == ADEQUATE:
         return z**2
     return math.nan if step.tests.poorly_fitted else step.tests.predicted_gain(name)
-
-
-def _contains_answer(effect: Effect, step: SelectionStep) -> Remark:
-    """Say that an effect contains one of the answer set: it can fit no worse, and need not be fitted."""
-    contained = [name for name in effect.replaces if name in step.answer_names]
-    return remark(CONTAINS, name=contained[0]) if contained else Remark()
 
 
 def _or_note(result: Diagnosis, code: str, found: Callable[[], Diagnosis]) -> Diagnosis:

@@ -2,17 +2,19 @@
 size a target power; and those that would reveal most of what could be missing.
 
 Designs are evaluated by linear theory: one trial of every condition is simulated once, information adds up over trials,
-and trials are added one by one and exchanged until none gains (Fedorov 1972, Theory of Optimal Experiments).
+and trials are added one by one, each the best beside those before it (Fedorov 1972, Theory of Optimal Experiments).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -110,24 +112,23 @@ def conditions_by_effort(
         yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
-def exchanged(design: Sequence[int], allowed: NDArray[np.intp], worth: Criterion) -> list[int]:
-    """Exchange the trials of a design one at a time for others of those allowed until none gains."""
-    design, best = list(design), float(worth(design)[0])
-    for _ in range(4):
-        before = best
-        for k in range(len(design)):
-            values = worth(design[:k] + design[k + 1 :], allowed)
-            if np.max(values) > (1 + 1e-6) * best:  # a gain, not rounding
-                design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
-        if best <= before:
+def added_one_by_one(allowed: NDArray[np.intp], worth: Criterion, most: int) -> list[int]:
+    """The trials of a design, each the best of those allowed beside the ones before it, as long as it gains."""
+    design: list[int] = []
+    now = float(worth(design)[0])
+    while len(design) < most:
+        values = worth(design, allowed)
+        if not np.max(values) > now:
             break
+        design.append(int(allowed[int(np.argmax(values))]))
+        now = float(np.max(values))
     return design
 
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
 #
-# Every condition within the limits is rated by linear theory, and the best set of trials found by exchange. Its
+# Every condition within the limits is rated by linear theory, and trials are added one by one. Their
 # separation is predicted by refitting simulated trials. Where no trials help, or only measurements are in question, the
 # advice is what to measure instead.
 
@@ -164,20 +165,16 @@ def _separations(rises: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(np.nansum(rises, axis=0) / count, 0.0)))
 
 
-def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
-    """The smaller separation of the two directions, by pair."""
-    pairs = itertools.combinations(range(len(separations)), 2)
-    return {(a, b): float(min(separations[a, b], separations[b, a])) for a, b in pairs}
+def _smaller(between: Floats) -> Floats:
+    """The smaller separation of the two directions of every pair. Shapes: between (…, n, n) → (…, n_pairs)."""
+    first, second = np.triu_indices(between.shape[-1], 1)
+    return np.minimum(between[..., first, second], between[..., second, first])
 
 
 @in_one_blas_thread
-def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
-    """Recommend trials that separate hypotheses which fit the same trials equally well."""
+def next_experiment(tied: Sequence[Fit], limits: Limits | None = None) -> NextExperiment:
+    """Recommend trials that separate two or more hypotheses which fit the same trials equally well."""
     limits = limits or Limits()
-    if len(tied) < 2:
-        raise FitError("A next experiment needs at least two hypotheses to separate: give at least two fits.")
-    if len({tuple(trial_data.trial.name for trial_data in fit.predictor.data) for fit in tied}) > 1:
-        raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
     # 5: most hypotheses that a design separates (chosen)
     tied = list(tied)[:5]
     # Each is named by the effects that not all of them have, numbered where that is ambiguous.
@@ -192,12 +189,9 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     films = filmed(tied, feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits))
     if not films:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
-    try:
-        designs = _designs_of(tied, [extended_fit(fit, films) for fit in tied])
-    except SimulationError as error:
-        raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
-    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits, seed)
-    return _recommendation(tied, names, design, rises, seed)
+    designs = _designs_of(tied, [extended_fit(fit, films) for fit in tied])
+    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits)
+    return _recommendation(tied, names, design, rises)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -229,19 +223,18 @@ def _designs_of(tied: Sequence[Fit], extended: Sequence[Fit]) -> list[Designs]:
 
 def worth(between: Floats) -> Floats:
     """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions
-    (T-optimality). Shapes: between (n_designs, n, n), in standard deviations → (n_designs,).
+    (T-optimality). Shapes: between (…, n, n), in standard deviations → (…).
     """
-    first, second = np.triu_indices(between.shape[1], 1)
-    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
+    square = _smaller(between) ** 2
     # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
-    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
+    return np.asarray(np.sum(square / (square + 5.0**2), axis=-1))
 
 
 def _best_option(
-    tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits, seed: int
+    tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits
 ) -> tuple[list[Condition], Floats]:
-    """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
-    exchanged one at a time. Returns design, rises (see `simulated_rises`).
+    """The best set of trials of the least effort that is sufficient, else of all. Returns design, rises (see
+    `simulated_rises`).
     """
 
     def worth_of(*design: Any) -> Floats:
@@ -257,26 +250,25 @@ def _best_option(
     options: list[tuple[list[Condition], Floats]] = []
     before = -math.inf
     for _, allowed in conditions_by_effort(conditions, best_vines):
-        start = [int(allowed[int(np.argmax(worth_of((), allowed, limits.trials)))])] * limits.trials
-        design = sorted(exchanged(start, allowed, worth_of))
+        design = sorted(added_one_by_one(allowed, worth_of, limits.trials))
         predicted = float(worth_of(design)[0])
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
             before, trials = predicted, [conditions[k] for k in design]
-            options.append((trials, simulated_rises(tied, trials, [0], seed)))
+            options.append((trials, simulated_rises(tied, trials, 0)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
-            if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
+            if _smaller(_separations(options[-1][1][None])).min() >= 8.0:
                 return options[-1]
-    return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
+    return max(options, key=lambda option: float(worth(_separations(option[1][None]))))
 
 
 def _recommendation(
-    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats, seed: int
+    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats
 ) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    between = _separations(np.concatenate([rises, simulated_rises(fits, design, [1], seed)]))
-    expected = _by_pair(between)
+    between = _separations(np.stack([rises, simulated_rises(fits, design, 1)]))
+    expected = dict(zip(itertools.combinations(range(len(fits)), 2), _smaller(between).tolist(), strict=True))
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
     worth_it = len(unresolved) < len(expected)
@@ -322,25 +314,25 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 # explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
 
 
-def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draws: Sequence[int], seed: int) -> Floats:
+def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draw: int) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
-    average. Shape (n_draws, n, n).
+    average. Shape (n, n).
     """
     n = len(tied)
     # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
     alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    rises = np.full((len(draws), n, n), math.nan)
+    rises = np.full((n, n), math.nan)
     before = np.array([-2 * fit.log_likelihood for fit in tied])
-    for k, a in np.ndindex(len(draws), n):
-        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * tied[a].solution.state.spread
+    for a, truth in enumerate(tied):
+        deviations = alternating[(np.arange(len(design)) + draw) % 4] * truth.solution.state.spread
         try:
-            films = _noisy_films(tied[a], design, deviations, np.random.default_rng([seed, 0, draws[k], a]))
+            films = _noisy_films(truth, design, deviations, np.random.default_rng([0, 0, draw, a]))
         except SimulationError:
             continue
         if films:
             after = np.array([_refitted(fit, films) for fit in tied])
-            rises[k, a] = after - before - (after[a] - before[a])
+            rises[a] = after - before - (after[a] - before[a])
     return rises
 
 
@@ -416,90 +408,58 @@ def further_trials(
     def information(design: Sequence[int], added: NDArray[np.intp] | None = None, times: float = 1.0) -> Floats:
         return np.maximum(designs.left(design, added, REPLICATES * times)[:, 0, 0], 0.0)
 
-    deviation = abs(value - now.zero)
-    wanted = float(information(())[0]) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
-    if not math.isfinite(wanted):
-        # 4.7: score that a size needs where the trials so far have no information about it (derived)
-        wanted = (4.7 / deviation) ** 2
     conditions = [condition for condition, _ in films]
-    # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
-    for _ in range(3):
-        chosen, needed = _fewest(conditions, information, wanted, most)
-        made, power = _made(replace(tests, fit=fit), [films[k] for k in chosen], plan)
-        plan = replace(plan, trials=made, power=power, n_conditions=len(films), needed=needed)
-        shortfall = abs(power.size_at(target) - now.zero) / deviation
-        if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most:
-            break
-        wanted = 1.02 * float(information(chosen)[0]) * shortfall**2
-    endless, known = information(range(len(films)), times=UNLIMITED), information(chosen[: len(made) // REPLICATES])
-    ratio = math.sqrt(endless[0] / max(known[0], 1e-300))
-    unlimited = plan.power.probability_at(plan.power.zero + ratio * (value - plan.power.zero))
-    return replace(plan, unlimited=max(unlimited, plan.after))
+    vines = np.array([condition.trial.vine for condition in conditions])
 
+    def best_vine(places: NDArray[np.intp]) -> list[str]:
+        """The new vine with the largest information in unlimited trials of all its conditions."""
+        known = {v: information(np.flatnonzero(vines == v).tolist(), times=UNLIMITED)[0] for v in vines[places]}
+        return [max(known, key=lambda vine: known[vine])]
 
-def _fewest(
-    conditions: Sequence[Condition], information: Criterion, wanted: float, most: int
-) -> tuple[list[int], dict[str, int]]:
-    """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
-
-    def cost(chosen: Sequence[int]) -> tuple[float, float]:
-        known = float(information(chosen)[0])
-        return (len(chosen), 0.0) if known >= wanted else (math.inf, -known)
-
-    def best_vines(places: NDArray[np.intp]) -> list[str]:
-        """The new vines with the largest information in unlimited trials of all their conditions."""
-        vines = np.array([condition.trial.vine for condition in conditions])
-        known = {vine: information(np.flatnonzero(vines == vine), times=UNLIMITED)[0] for vine in vines[places]}
-        # 2: new vines that are tried, one at a time (chosen)
-        return sorted(known, key=lambda vine: -known[vine])[:2]
-
-    options: dict[str, list[int]] = {}
     effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-    for effort, allowed in conditions_by_effort(conditions, best_vines):
-        words, chosen = effort_words[effort], _smallest(allowed, information, wanted, most)
-        options[words] = min(options.get(words, chosen), chosen, key=cost)
-    reached = {words: REPLICATES * len(chosen) for words, chosen in options.items() if cost(chosen)[0] < math.inf}
-    return min(options.values(), key=cost, default=[]), reached
+    chosen, needed = list[int](), dict[str, int]()
+    power: Callable[[int], EffectPower] = cache(lambda _: now)
+    for effort, allowed in conditions_by_effort(conditions, best_vine):
+        pairs = added_one_by_one(allowed, information, most)
+        if not pairs:
+            continue
+        short, with_pairs = _with_pairs(replace(tests, fit=fit), [films[k] for k in pairs], plan)
+        if short < len(pairs):
+            # With more effort only fewer trials are worth it.
+            most, needed[effort_words[effort]] = short, REPLICATES * (short + 1)
+        if short < len(pairs) or not needed:
+            chosen, power = pairs[: short + 1], with_pairs
+    made: list[dict[str, Any]] = []
+    for k, place in enumerate(chosen, 1):
+        cells = _entry(conditions[place], "yield_pressure_kPa", "capture_fps")
+        known = {name: cell for name, cell in cells.items() if cell == cell}  # NaN is not equal to itself
+        made += [{**known, "probability": power(k).probability_at(value)}] * REPLICATES
+    final = power(len(chosen))
+    plan = replace(plan, power=final, trials=tuple(made), needed=needed, n_conditions=len(films))
+    endless, so_many = information(range(len(films)), times=UNLIMITED)[0], information(chosen)[0]
+    away = math.sqrt(endless / max(so_many, 1e-300)) * (value - final.zero)
+    return replace(plan, unlimited=max(final.probability_at(final.zero + away), plan.after))
 
 
-def _smallest(allowed: NDArray[np.intp], information: Criterion, wanted: float, most: int) -> list[int]:
-    """Pairs added one by one up to the wanted information, exchanged, and as many as are needed of these, the most
-    informative first.
-    """
-    chosen: list[int] = []
-    now = float(information(chosen)[0])
-    while now < wanted and len(chosen) < most:
-        values = information(chosen, allowed)
-        if not np.max(values) > now:
-            break
-        chosen.append(int(allowed[int(np.argmax(values))]))
-        now = float(np.max(values))
-    chosen = exchanged(chosen, allowed, information)
-    order: list[int] = []
-    while chosen and (not order or information(order)[0] < wanted):
-        order.append(chosen.pop(int(np.argmax(information(order, np.array(chosen))))))
-    return order
-
-
-def _made(
+def _with_pairs(
     tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], plan: FurtherTrials
-) -> tuple[tuple[dict[str, Any], ...], EffectPower]:
-    """Pairs of these trials, as many as needed, with the probability after each; and the power with them."""
-    before, power, probability = len(tests.fit.trials), plan.power, plan.before
+) -> tuple[int, Callable[[int], EffectPower]]:
+    """How many pairs of these trials, in their order, fall short of the target, and the power with so many of them."""
     different = list({condition.trial.name: (condition, film) for condition, film in films}.values())
     with_all = misfit_tests(extended_fit(tests.fit, different), tests.effects, tests.level)
     places = {trial.name: k for k, trial in enumerate(with_all.fit.trials)}
-    rows, trials = list(range(before)), []
-    for condition, _ in films:
-        if probability >= plan.target:
-            break
-        rows += [places[condition.trial.name]] * REPLICATES
-        power = effect_power(_of_trials(with_all, rows), power.effect) or power
-        probability = power.probability_at(plan.value)
-        cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
-        known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
-        trials += [{**known, "probability": probability}] * REPLICATES
-    return tuple(trials), power
+    added = [places[condition.trial.name] for condition, _ in films for _ in range(REPLICATES)]
+
+    @cache
+    def power(pairs: int) -> EffectPower:
+        rows = [*range(len(tests.fit.trials)), *added[: REPLICATES * pairs]]
+        return effect_power(_of_trials(with_all, rows), plan.power.effect) or plan.power
+
+    def probability(pairs: int) -> float:
+        return power(pairs).probability_at(plan.value)
+
+    reached = probability(len(films)) >= plan.target
+    return bisect_left(range(1, len(films)), plan.target, key=probability) if reached else len(films), power
 
 
 def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
@@ -510,5 +470,4 @@ def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
     columns, cross_products = tuple(solution.columns[k] for k in places), solution.cross_products[rows]
     solution = replace(solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
     part, products = at_solution(fit, predictor, solution), tests.products.of(places)
-    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
-    return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
+    return replace(tests, fit=part, products=products, scores=scores_of(part, products))

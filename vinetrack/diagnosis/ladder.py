@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Kinematics, Track
+from vinetrack.core.records import Kinematics, Track
 from vinetrack.core.terminal import plot
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import (
+    AlignedTrials,
     Replicates,
     by_condition,
     expected_error,
@@ -33,9 +34,8 @@ from vinetrack.diagnosis.replicates import (
 )
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
-from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.fit import fit, fit_subset, predict_prepared, prepared_pairs
+from vinetrack.inference.fit import fit, fit_subset, predict_prepared
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import Predictor
@@ -105,7 +105,7 @@ FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at whic
 @dataclass(frozen=True, repr=False)
 class Comparison:
     """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`. `trajectories` holds
-    the trials of each condition with the model's prediction, see `trajectory_table`. `trials` are the predictions.
+    the frames of each condition with the model's prediction, see `Replicates`. `trials` are the predictions.
     """
 
     table: pd.DataFrame
@@ -135,14 +135,10 @@ def compare(
     """Compare a fitted model with the trials of an experiment."""
     import pandas as pd
 
-    fitted = {trial.name for trial in fit.trials}
-    chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
-    courses, _ = residual_courses(fit)
+    courses, predicted, aligned = residual_courses(fit)
     scatter, of_condition = replicate_scatter(fit, courses), by_condition(courses)
-    predicted = predict_prepared(fit, prepared_pairs(chosen), from_rest=True)
-    final = _final_speed_errors(
-        fit, predicted, {trial.name: track for trial, track in chosen}, kinematics or {}, final_at_fraction
-    )
+    measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
+    final = _final_speed_errors(aligned, predicted, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
     for condition, together in replicates_by_condition(predicted).items():
         known = [final[trial.name] for trial in together.trials if math.isfinite(final[trial.name])]
@@ -155,7 +151,7 @@ def compare(
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
-        trajectories[condition] = trajectory_table(together)
+        trajectories[condition] = together.frames
     return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(predicted))
 
 
@@ -168,33 +164,26 @@ def rms_of(trials: Iterable[TrialFit]) -> float:
 
 
 def position_errors(together: Replicates) -> dict[str, float]:
-    """Position errors of one condition: columns of `comparison.csv`, m, s and ratios."""
+    """Position errors of one condition: columns of `comparison.csv`, m, s and ratios. The worst place is that of the
+    largest mean residual of the replicates, smoothed.
+    """
     rms_m, floor_m = rms_of(together.trials), together.floor_m
-    worst_at_s, worst_at_m = _worst(together)
+    moving = together.instants[together.instants["moves"]]
+    # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
+    width = 2 * int(0.05 * len(moving) / 2) + 1
+    smoothed_m = moving["mean_m"].rolling(width, center=True, min_periods=1).mean()
+    worst = moving.iloc[int(np.argmax(smoothed_m.abs()))]
     return {
         "rms_position_m": rms_m,
         "replicate_floor_m": floor_m,
         "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
-        "worst_at_s": worst_at_s,
-        "worst_at_m": worst_at_m,
+        "worst_at_s": float(worst["time_s"]),
+        "worst_at_m": float(worst["lead_position_m"]),
     }
 
 
-def _worst(together: Replicates) -> tuple[float, float]:
-    """Time since release and growth where the smoothed mean residual of the replicates is largest."""
-    residual_m, time_s = together.mean_residual_m[together.moving], together.time_s[together.moving]
-    if not time_s.size:
-        return math.nan, math.nan
-    # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
-    half, places = int(0.05 * residual_m.size / 2), np.arange(residual_m.size)
-    cumulative = np.concatenate([[0.0], np.cumsum(residual_m)])
-    low, high = np.maximum(places - half, 0), np.minimum(places + half + 1, residual_m.size)
-    worst = int(np.argmax(np.abs((cumulative[high] - cumulative[low]) / (high - low))))
-    return float(time_s[worst]), float((together.model_m[together.moving] + residual_m)[worst])
-
-
 def _final_speed_errors(
-    fit: Fit,
+    aligned: AlignedTrials,
     predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
     kinematics: Mapping[str, Kinematics],
@@ -205,11 +194,10 @@ def _final_speed_errors(
     """
     # 3.0: duration of the simulation, in durations of the recording, so that a slow model reaches the same
     # position (chosen)
-    times = [3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
-    traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
-    runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces, host=fit.predictor.host)
+    times_s = [t.release_s + 3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    runs = aligned.predictor.run(aligned.predictor.jobs(np.empty(0), aligned.trial_effects), times_s)
     errors = {}
-    for trial, time_s, run in zip(predicted, times, runs, strict=True):
+    for trial, time_s, run in zip(predicted, times_s, runs, strict=True):
         motion = kinematics.get(trial.name) or estimate_kinematics(
             tracks[trial.name], travel_ratio=trial.trial.travel_ratio
         )
@@ -221,37 +209,6 @@ def _final_speed_errors(
         by_model = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
         errors[trial.name] = (by_model if math.isfinite(by_model) else 0.0) - measured
     return errors
-
-
-def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats] | None:
-    if track.pressure_Pa is None:
-        return None
-    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-    return track.time_s[known] - release_s, track.pressure_Pa[known]
-
-
-def trajectory_table(together: Replicates) -> pd.DataFrame:
-    """Trials of one condition with the model, since release and from the origin.
-    `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
-    """
-    import pandas as pd
-
-    mean_m, sigma_m = together.model_m + together.mean_residual_m, np.sqrt(together.variance_m2)
-    step_s = float(np.diff(together.time_s)[0]) if together.time_s.size > 1 else 1.0
-    parts = []
-    for trial in together.trials:
-        time_s = trial.time_s - trial.release_s
-        k = np.clip(np.rint((time_s - together.time_s[0]) / step_s).astype(int), 0, mean_m.size - 1)
-        columns = {
-            "trial": trial.name,
-            "time_s": time_s,
-            "lead_position_m": trial.lead_position_m - trial.origin_m,
-            "model_position_m": trial.predicted_position_m - trial.origin_m,
-            "replicates_mean_m": mean_m[k],
-            "replicates_sigma_m": sigma_m[k],
-        }
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
 
 
 # ------------------------------------------------------------------------------
@@ -303,7 +260,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
     floor_m = inside[0].floor_m
-    courses, _ = residual_courses(fits[0])
+    courses, *_ = residual_courses(fits[0])
     expected = expected_error(courses, replicate_scatter(fits[0], courses))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
@@ -363,29 +320,15 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         others = fit_subset(
-            fit,
-            [not out for out in gone],
-            hold_spreads=True,
-            hold_noise=True,
-            most_iterations=MOST_ITERATIONS,
+            fit, [not out for out in gone], hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
         )
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
-    undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
-    undetermined &= {number.vine for number in fit.numbers if number.key in fit.model.parameter_names}
-    not_predicted = {
-        trial_data.trial.name: remark("undetermined_vine", vine=trial_data.trial.vine)
-        for trial_data in data
-        if trial_data.trial.vine in undetermined
-    }
-    predictable = [trial_data for trial_data in data if trial_data.trial.name not in not_predicted]
-    return _combined([_predicted(others, predictable), Errors((), not_predicted)])
+    return _predicted(others, data)
 
 
 def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
-    """Predictions of trials; where the simulation of a trial fails, the reason instead."""
-    if not data:
-        return Errors((), {})
+    """Predictions of trials, or why one cannot be predicted: the fit lacks its parameters, or its simulation fails."""
     try:
         return Errors(tuple(predict_prepared(fit, data, from_rest=True)), {})
     except FitError as error:

@@ -19,7 +19,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from vinetrack.core.problems import Remark, remark
@@ -47,7 +46,7 @@ from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 from vinetrack.inference.systematics import systematics_of
-from vinetrack.planning.candidate_trials import at_solution
+from vinetrack.planning.candidate_trials import at_solution, extended_fit
 
 # ------------------------------------------------------------------------------
 # Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
@@ -63,18 +62,8 @@ def noiseless_start(fit: Fit) -> Fit:
     """The fit with the deviations of its trials set to zero, linearised there: the same start for every effect."""
     trial_effects = fit.state.trial_effects.copy()
     trial_effects[:, DEVIATION_COLUMNS] = 0.0
-    state, predictor = replace(fit.state, trial_effects=trial_effects), _predictor_of(fit, fit.predictor.data)
-    columns = tuple(predictor.linearise(state.theta, trial_effects))
-    solution = replace(fit.solution, state=state, columns=columns)
-    return replace(fit, predictor=predictor, solution=solution, with_errors=None)
-
-
-def _predictor_of(fit: Fit, data: Sequence[FitTrial]) -> Predictor:
-    """A predictor for other positions of the same trials, with the same initial finite-difference steps."""
-    before = fit.predictor
-    predictor = Predictor(before.layout, data, before.host)
-    predictor.steps, predictor.pressure_step = before.steps.copy(), before.pressure_step.copy()
-    return predictor
+    solution = replace(fit.solution, state=replace(fit.state, trial_effects=trial_effects))
+    return extended_fit(replace(fit, solution=solution), ())
 
 
 def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) -> tuple[Floats, Floats]:
@@ -120,44 +109,34 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
 
 def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
-    state, before = start.state, start.predictor.data
-    jobs = start.predictor.jobs(state.theta, state.trial_effects)
-    jobs = jobs.with_effect([shape.size.zero + size, *shape.other_values])
-    moved = start.predictor.run(jobs, model=start.model + shape.effect)
-    used = [_used_points(trial_data, trajectory) for trial_data, trajectory in zip(before, moved, strict=True)]
-    origins_m = state.trial_effects[:, ORIGIN]
-    data = [
-        _with_positions(trial_data, origin_m + trajectory.observed_position_m, keep)
-        for trial_data, trajectory, origin_m, keep in zip(before, moved, origins_m, used, strict=True)
-    ]
+    state, before = start.state, start.predictor
+    jobs = before.jobs(state.theta, state.trial_effects).with_effect([shape.size.zero + size, *shape.other_values])
+    moved = before.run(jobs, model=start.model + shape.effect)
+    data = list(map(_as_moved, before.data, moved, state.trial_effects[:, ORIGIN]))
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
-    initial = [columns[keep] for columns, keep in zip(start.solution.columns, used, strict=True)]
-    for columns, trial_data, measured, keep in zip(initial, data, before, used, strict=True):
-        columns[:, -1] += trial_data.lead_position_m - measured.lead_position_m[keep]
-    predictor = _predictor_of(start, data)
+    predictor = Predictor(before.layout, data, before.host)
+    predictor.steps, predictor.pressure_step = before.steps.copy(), before.pressure_step.copy()
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
-    how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2, "columns": initial}
-    solution = solve(predictor, start.solution.problem, state, held, warm=True, **how)
-    return at_solution(start, predictor, solution)
+    how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2}
+    return at_solution(start, predictor, solve(predictor, start.solution.problem, state, held, warm=True, **how))
 
 
-def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Points that a fit uses: before the last part of the growth, and not next to its end."""
+def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> FitTrial:
+    """A trial with the positions of a trajectory, at the points that a fit uses: before the last part of the growth,
+    and not next to its end. Stretches without gaps begin anew behind a gap.
+    """
     length_m = np.nan_to_num(trial_data.trial.length_m, nan=math.inf)
     behind_s = trajectory.end_time_s + (FRAMES_BEHIND_END + 1) * trial_data.frame_s
     behind = (trajectory.status == "ended") & (trajectory.time_s > behind_s)
-    return np.asarray((trajectory.lead_position_m < END_FRACTION * length_m) | behind)
-
-
-def _with_positions(trial_data: FitTrial, position_m: Floats, keep: NDArray[np.bool_]) -> FitTrial:
-    """A trial with other positions, at the points that a fit uses; stretches without gaps begin anew behind a gap."""
+    keep = (trajectory.lead_position_m < END_FRACTION * length_m) | behind
     stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
-    first = np.concatenate([[True], np.diff(stretch) > 0])
     known = {name: getattr(trial_data, name) for name in ("time_s", "stated_m", "slow_m", "relative_sd")}
     of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
-    return replace(trial_data, lead_position_m=position_m[keep], first=first, **of_points)
+    first = np.concatenate([[True], np.diff(stretch) > 0])
+    position_m = origin_m + trajectory.observed_position_m[keep]
+    return replace(trial_data, lead_position_m=position_m, first=first, **of_points)
 
 
 def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
@@ -421,7 +400,6 @@ def _false_alarms(fit: Fit) -> dict[str, float]:
         "any smooth force": 0.1 * level,
         "the loudest probe": min(SINGLE_PROBE_LEVEL, level),
         "replicates that err alike": 0.1 * level,
-        "noise that is larger in motion": 0.1 * level,
     }
     trials = [trial.trial for trial in fit.trials]
     if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):

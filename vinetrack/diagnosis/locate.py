@@ -98,7 +98,7 @@ def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails."""
     import pandas as pd
 
-    courses, predicted = residual_courses(fit)
+    courses, predicted, _ = residual_courses(fit)
     scatter, together = replicate_scatter(fit, courses), replicates_by_condition(predicted)
     rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in by_condition(courses).items()]
     return Failure(

@@ -2,8 +2,8 @@
 
 A model is rejected by any of three kinds of test. Score tests are made of each candidate (`score_test`, with
 family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces
-(`structure_test`), and tests of the trial effects and the noise (`trial_effect_tests`). The last compares the misfit
-with the noise and the slow errors of the tracks.
+(`structure_of`), and a test of the trial effects (`between_conditions_p`). The last compares the misfit with the noise
+and the slow errors of the tracks.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vinetrack.diagnosis.score_test import (
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, relative_residual, variance_floor
+from vinetrack.inference.optimiser import is_poor_fit, relative_residual
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, cluster_variance
 from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 
@@ -50,11 +50,10 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     fastest = max(
         trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in fit.trials
     )
-    lengths = [trial.trial.length_m for trial in fit.trials]
-    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in fit.trials]
+    # As a part of the length where that is known
     reach = max(
-        grown / length if math.isfinite(length) and length > 0 else grown
-        for grown, length in zip(reaches, lengths, strict=True)
+        float(np.max(trial.lead_position_m) - trial.origin_m) / (np.nan_to_num(trial.trial.length_m) or 1.0)
+        for trial in fit.trials
     )
     varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
     shapes = []
@@ -120,15 +119,10 @@ def structure_from_scores(scores: Scores) -> Structure:
 
 
 # ------------------------------------------------------------------------------
-# Two tests of whether trial effects and noise have absorbed what a model lacks.
+# Whether trial effects have absorbed what a model lacks.
 #
 # The deviations of pressure and B of each trial can absorb part of a misfit. Deviations by chance differ between
-# replicates of a condition; those that compensate for the model are the same in all of them. What the deviations
-# cannot absorb is estimated as noise: positions are then noisier in motion than at rest, summed over stretches as
-# long as slow errors last.
-
-STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
-
+# replicates of a condition; those that compensate for the model are the same in all of them.
 
 MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)
 
@@ -188,61 +182,17 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     """
     from scipy.stats import f
 
-    names = sorted(set(groups))
-    members = [values[[group == name for group in groups]] for name in names]
-    within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
-    inner, outer = values.size - len(names), len(names) - fitted
+    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
+    mean = np.bincount(group, values) / count
+    inner, outer = values.size - count.size, count.size - fitted
     if inner < MIN_REPLICATE_DEGREES or outer < 1:
         return math.nan
-    between = sum(member.size * float(member.mean()) ** 2 for member in members)
+    within, between = float(np.sum((values - mean[group]) ** 2)), float(np.sum(count * mean**2))
     if not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
     within_variance = max(within / inner, allowed**2 / 9)
     return float(f.sf(between / outer / within_variance, outer, inner))
-
-
-def noise_in_motion_p(fit: Fit) -> float:
-    """p-value that residuals summed over stretches are no noisier in motion than at rest; 1 where this is unknown."""
-    from scipy.stats import f
-
-    at_rest: list[Floats] = []
-    in_motion: list[Floats] = []
-    rest_degrees = 0.0
-    for trial, trial_data in zip(fit.trials, fit.predictor.data, strict=True):
-        if (
-            trial_data.slow_m is not None
-            or trial_data.gauge_error > 0
-            or trial_data.noise_m**2 < variance_floor([trial_data])[0]
-        ):
-            continue
-        standstill = _stretch_sums(trial.whitened[: trial_data.n_rest])
-        if standstill.size < 2:
-            continue
-        at_rest.append((standstill - standstill.mean()) * math.sqrt(standstill.size / (standstill.size - 1)))
-        in_motion.append(_stretch_sums(trial.whitened[trial_data.n_rest :]))
-        rest_degrees += standstill.size - 1
-    # 12: degrees of freedom of the stretches at rest below which the noise test is not made (chosen)
-    if rest_degrees < 12:
-        return 1.0
-    still, moving = np.concatenate(at_rest), np.concatenate(in_motion)
-    ratio = float(np.mean(moving**2) / np.mean(still**2))
-    return float(f.sf(ratio, _degrees(moving, moving.size), _degrees(still, rest_degrees)))
-
-
-def _stretch_sums(white: Floats) -> Floats:
-    """Sums over successive stretches, of variance 1 if the residuals are white."""
-    count = white.size // STRETCH_FRAMES
-    return np.asarray(
-        white[: count * STRETCH_FRAMES].reshape(count, STRETCH_FRAMES).sum(axis=1) / math.sqrt(STRETCH_FRAMES)
-    )
-
-
-def _degrees(values: Floats, count: float) -> float:
-    """Effective degrees of freedom of a mean square, fewer where the tails are heavy."""
-    square = float(np.mean(values**2))
-    kurtosis = float(np.mean(values**4)) / square**2 if square > 0 else 3.0
-    return 2 * count / max(kurtosis - 1, 2.0)
 
 
 # Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
@@ -325,17 +275,17 @@ class MisfitTests:
 
     @property
     def omnibus_rejects(self) -> bool:
-        """Whether a test that names no candidate rejects: probe forces, or trial effects and noise."""
+        """Whether a test that names no candidate rejects: probe forces, or trial effects."""
         return self.probes_reject or self.trial_effect_p < 0.1 * self.level
 
     @cached_property
     def trial_effect_p(self) -> float:
-        """p-value of the trial effects: conditions differ more than replicates, or noise is larger in motion."""
-        return min(between_conditions_p(self.fit), noise_in_motion_p(self.fit))
+        """p-value of the trial effects: conditions differ no more than replicates."""
+        return between_conditions_p(self.fit)
 
     @property
     def needs_search(self) -> bool:
-        """Whether to search even where every test passes: trial effects and noise may have absorbed the misfit."""
+        """Whether to search even where every test passes: trial effects or noise may have absorbed the misfit."""
         # 1e-2: p-value of the trial effects below which a model that passes every test is searched too (chosen)
         return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < 1e-2
 

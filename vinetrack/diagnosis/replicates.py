@@ -12,16 +12,14 @@ are estimated from differences between replicates alone, so that a model that fa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
+from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -34,11 +32,14 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
-from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
+from vinetrack.tracks.frame_timing import frames_surely_missing
 from vinetrack.tracks.position_noise import rest_points
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # ------------------------------------------------------------------------------
 # Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
@@ -78,29 +79,29 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
         return []
     stated_Pa = [trial_data.typical_pressure_Pa for trial_data in data]
     force_N = np.array([_force_N(*pair) for pair in zip(trials, stated_Pa, strict=True)])
-    driven = force_N > 0
     of_vine = np.array([trial.vine for trial in trials])
-    vines = np.unique(of_vine[driven])
+    vines = np.unique(of_vine)
     # 2: slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
-    remaining = int(np.count_nonzero(driven)) - vines.size - 2
-    if np.count_nonzero(driven) < FEWEST_TRIALS or remaining < 1:
+    remaining = len(data) - vines.size - 2
+    if remaining < 1:
         return []
-    log_force, log_speed = np.log(force_N[driven]), np.log([middle_speed(trial_data) for trial_data in data])
-    log_speed -= np.median(log_speed[driven])
+    # A trial that its stated force could not move lies far off every curve.
+    log_force = np.log(np.maximum(force_N, 1e-9))
+    log_speed = np.log([middle_speed(trial_data) for trial_data in data])
+    log_speed -= np.median(log_speed)
     curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
     usual_exponent = 0.37  # Starting value of the exponent (PHYSICS)
-    straight = log_force - usual_exponent * log_speed[driven]
-    levels = [float(np.median(straight[of_vine[driven] == vine])) for vine in vines]
+    straight = log_force - usual_exponent * log_speed
+    levels = [float(np.median(straight[of_vine == vine])) for vine in vines]
     # 0.05: residual of ln F at which the robust fit (Cauchy loss) halves the weight of a trial (chosen)
     fitted = least_squares(
-        lambda values: log_force - curves[driven] @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
+        lambda values: log_force - curves @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
     )
-    residual = np.full(len(data), -np.inf)
-    residual[driven] = log_force - curves[driven] @ fitted.x
+    residual = log_force - curves @ fitted.x
     # Fitted curves follow the trials: the scatter about them is smaller by the degrees of freedom that they take.
-    median_deviation = float(np.median(np.abs(residual[driven]))) / 0.6745
+    median_deviation = float(np.median(np.abs(residual))) / 0.6745
     # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
-    scatter = max(median_deviation * math.sqrt(np.count_nonzero(driven) / remaining), 0.02)
+    scatter = max(median_deviation * math.sqrt(len(data) / remaining), 0.02)
     # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
     # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
     allowed = scatter * float(student.isf(CHANCE / (2 * len(data)), max(0.37 * remaining + 1.0, 3.0)))
@@ -115,11 +116,10 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     # 0.125: the largest fraction that may be outliers (chosen)
     if len(odd) > max(2, int(0.125 * len(data))):
         return []
-    expected_N = np.where(np.isin(of_vine, vines), np.exp(curves @ fitted.x), math.nan)
-    implied_Pa = [stated_Pa[k] + (expected_N[k] - force_N[k]) / trials[k].area_m2 for k in odd]
+    lacking_Pa = [(np.exp(curves[k] @ fitted.x) - force_N[k]) / trials[k].area_m2 for k in odd]
     return [
-        OddTrial(trials[k].name, stated_Pa[k], float(Pa), trials[k].pressure_unit)
-        for k, Pa in zip(odd, implied_Pa, strict=True)
+        OddTrial(trials[k].name, stated_Pa[k], stated_Pa[k] + float(lacks), trials[k].pressure_unit)
+        for k, lacks in zip(odd, lacking_Pa, strict=True)
     ]
 
 
@@ -169,17 +169,11 @@ def _overruled(result: Diagnosis, words: str, **first: Any) -> Diagnosis:
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
 
 
-def lost_frames(tracks: Iterable[tuple[str, Track]]) -> dict[str, bool]:
+def lost_frames(pairs: Pairs) -> dict[str, bool]:
     """Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain."""
-    return {name: frames_surely_missing(track) for name, track in tracks if with_flag(track.flag, "retimed").any()}
-
-
-def dropped_frames_in(fit: Fit) -> dict[str, bool]:
-    """Find trials of a fit whose dropped frames were not corrected, as `lost_frames`."""
-    return lost_frames(
-        (trial_data.trial.name, correct_frames(plain_track(trial_data.time_s, trial_data.lead_position_m)))
-        for trial_data in fit.predictor.data
-    )
+    return {
+        trial.name: frames_surely_missing(track) for trial, track in pairs if with_flag(track.flag, "retimed").any()
+    }
 
 
 def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
@@ -203,73 +197,67 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Replicates:
-    """Residuals of the trials of one condition at common times since release, shape (n_trials, n_times), NaN where a
-    trial is absent: measurement minus model. `model_m`, shape (n_times,), is the model's growth in the longest trial.
+    """Trials of one condition: all `frames`, since release and from the origin, with the mean of the replicates then
+    and their standard deviation; and the mean and variance of the residuals, measurement minus model, at `instants` one
+    frame apart, with the number of trials present and whether any of them has begun to move.
     """
 
     trials: Sequence[TrialFit]
-    time_s: Floats
-    model_m: Floats
-    residual_m: Floats
-
-    @cached_property
-    def present(self) -> Floats:
-        """Number of trials present at each time, shape (n_times,)."""
-        return np.isfinite(self.residual_m).sum(axis=0).astype(float)
-
-    @cached_property
-    def moving(self) -> NDArray[np.bool_]:
-        """Times at which a trial that has begun to move is present, shape (n_times,)."""
-        begin_s = min(float(trial.time_s[first_that_counts(trial)]) - trial.release_s for trial in self.trials)
-        return (self.time_s >= begin_s - 1e-9) & (self.present > 0)
-
-    @cached_property
-    def mean_residual_m(self) -> Floats:
-        """Mean of the replicates minus the model, shape (n_times,); NaN where none is present."""
-        return np.where(self.present > 0, np.nansum(self.residual_m, axis=0) / np.maximum(self.present, 1), math.nan)
-
-    @cached_property
-    def variance_m2(self) -> Floats:
-        """Unbiased variance of single replicates, shape (n_times,); NaN where fewer than two are present."""
-        square = np.nansum((self.residual_m - self.mean_residual_m) ** 2, axis=0)
-        return np.where(self.present > 1, square / np.maximum(self.present - 1, 1), math.nan)
+    frames: pd.DataFrame
+    instants: pd.DataFrame
 
     @property
     def floor_m(self) -> float:
         """Replicate floor: rms deviation of a replicate from the mean of infinitely many; NaN for one trial alone."""
-        use = self.moving & (self.present > 1)
-        return math.sqrt(np.average(self.variance_m2[use], weights=self.present[use])) if use.any() else math.nan
+        use = self.instants[self.instants["moves"] & (self.instants["present"] > 1)]
+        return math.sqrt(np.average(use["variance_m2"], weights=use["present"])) if len(use) else math.nan
 
 
 def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
-    """Residuals of a model for the trials of one condition at common times. Each instant uses the nearest frame of each
-    trial: interpolation would average the noise of positions away, and positions, other than residuals, change by much
+    """Residuals of a model for the trials of one condition at common times. A frame counts at the instant nearest to
+    it: interpolation would average the noise of positions away, and positions, other than residuals, change by much
     more than their noise within half a frame.
     """
-    from scipy.interpolate import PchipInterpolator
+    import pandas as pd
 
-    since_s = [trial.time_s - trial.release_s for trial in trials]
-    longest = max(range(len(trials)), key=lambda i: since_s[i][-1])
-    frame_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
-    begin_s, end_s = min(float(each[0]) for each in since_s), since_s[longest][-1]
-    time_s = begin_s + frame_s * np.arange(math.floor((end_s - begin_s) / frame_s + 1e-6) + 1)
-    growth = PchipInterpolator(since_s[longest], trials[longest].predicted_position_m - trials[longest].origin_m)
-    model_m = np.asarray(growth(np.clip(time_s, since_s[longest][0], end_s)))
-    residual_m = np.array([_nearest(time_s, *pair) for pair in zip(since_s, trials, strict=True)])
-    return Replicates(trials, time_s, model_m, residual_m)
+    step_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
+    parts = [
+        pd.DataFrame(
+            {
+                "trial": trial.name,
+                "time_s": trial.time_s - trial.release_s,
+                "lead_position_m": trial.lead_position_m - trial.origin_m,
+                "model_position_m": trial.predicted_position_m - trial.origin_m,
+                "residual_m": trial.residual_m,
+                "moves": np.arange(trial.time_s.size) >= first_that_counts(trial),
+            }
+        )
+        for trial in trials
+    ]
+    frames = pd.concat(parts, ignore_index=True)
+    instant = np.rint(frames["time_s"] / step_s)
+    residual_m = frames.pivot_table("residual_m", instant, "trial")
+    of_instant = frames.groupby(instant)
+    instants = pd.DataFrame(
+        {
+            "time_s": step_s * residual_m.index,
+            "lead_position_m": of_instant["lead_position_m"].mean(),
+            "mean_m": residual_m.mean(axis=1),
+            "variance_m2": residual_m.var(axis=1),
+            "present": residual_m.count(axis=1),
+            "moves": of_instant["moves"].any(),
+        }
+    )
+    at = instants.loc[instant]
+    frames["replicates_mean_m"] = frames["model_position_m"] + at["mean_m"].to_numpy()
+    frames["replicates_sigma_m"] = np.sqrt(at["variance_m2"].to_numpy())
+    return Replicates(trials, frames.drop(columns=["residual_m", "moves"]), instants)
 
 
 def replicates_by_condition(trials: Sequence[TrialFit]) -> dict[str, Replicates]:
     """The replicates of each condition, in order."""
     names = dict.fromkeys(trial.trial.condition for trial in trials)
     return {name: replicates_of([trial for trial in trials if trial.trial.condition == name]) for name in names}
-
-
-def _nearest(at_s: Floats, since_s: Floats, trial: TrialFit) -> Floats:
-    """Residuals of the frames nearest to times since release, NaN where none is within half a frame's spacing."""
-    k = np.clip(np.searchsorted(since_s, at_s), 1, since_s.size - 1)
-    k -= at_s - since_s[k - 1] < since_s[k] - at_s
-    return np.where(np.abs(since_s[k] - at_s) <= 0.51 * np.median(np.diff(since_s)), trial.residual_m[k], math.nan)
 
 
 def first_that_counts(trial: TrialFit) -> int:
@@ -308,10 +296,7 @@ class AlignedTrials:
 def align_trials(fit: Fit) -> AlignedTrials:
     """Align the model with the trials that it was fitted to, by release and origin."""
     predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
-    try:
-        return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
+    return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
 
 
 def orthogonal_part(columns: Floats, others: Floats) -> Floats:
@@ -354,11 +339,11 @@ class ResidualCourse:
         return np.asarray(np.diag(self.noise_m2 / np.maximum(count, 1.0)) + self.origin_m2)
 
 
-def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit]]:
+def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit], AlignedTrials]:
     """Courses of the trials of a fit, and the trials as predicted with their own release and origin."""
     predicted = predict_prepared(fit, fit.predictor.data, from_rest=True)
     aligned = align_trials(fit)
-    return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted
+    return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted, aligned
 
 
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
@@ -434,14 +419,10 @@ class Scatter:
 
     def covariance(self, response_m: Floats, noise_m2: Floats) -> Floats:
         """Covariance of the means of one trial's stretches, m². Shapes: response_m (n, 2), noise_m2 (n, n) → (n, n)."""
-        return _covariance(response_m, noise_m2, np.array([self.pressure, self.damping, self.residual]) ** 2)
-
-
-def _covariance(response_m: Floats, noise_m2: Floats, variances: Floats) -> Floats:
-    shared = (response_m * variances[:2]) @ response_m.T
-    residual = variances[2] * float(np.trace(shared)) / len(shared)
-    # 1e-6: lower limit of the error of a stretch mean, m (chosen)
-    return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
+        shared = response_m * (self.pressure**2, self.damping**2) @ response_m.T
+        residual = self.residual**2 * float(np.trace(shared)) / len(shared)
+        # 1e-6: lower limit of the error of a stretch mean, m (chosen)
+        return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 
 
 def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
@@ -457,20 +438,20 @@ def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
         return Scatter(spreads[0], spreads[1], start_values[2], 0)
     deviations = [group.means_m - group.means_m.mean(axis=0) for group in groups]
 
+    def scatter(logs: Floats) -> Scatter:
+        pressure, damping, residual = np.exp(np.clip(logs, lower_bounds, upper_bounds)).tolist()
+        return Scatter(pressure, damping, residual, dof)
+
     def minus_two_log_likelihood(logs: Floats) -> float:
         total = 0.0
         for group, deviation_m in zip(groups, deviations, strict=True):
-            variances = np.exp(2 * np.clip(logs, lower_bounds, upper_bounds))
-            covariance = _covariance(group.response_m, group.noise_m2, variances)
+            covariance = scatter(logs).covariance(group.response_m, group.noise_m2)
             total += (len(deviation_m) - 1) * float(np.linalg.slogdet(covariance)[1])
             total += float(np.sum(deviation_m * np.linalg.solve(covariance, deviation_m.T).T))
         return total
 
-    best = minimize(
-        minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
-    )
-    pressure, damping, residual = np.exp(np.clip(best.x, lower_bounds, upper_bounds)).tolist()
-    return Scatter(pressure, damping, residual, dof)
+    how = {"xatol": 0.02, "fatol": 0.01}
+    return scatter(minimize(minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options=how).x)
 
 
 def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:

@@ -46,11 +46,11 @@ from vinetrack.inference.systematics import Systematics
 
 NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
+REACH_SIGMAS = 3.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
 
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
 
-# Columns that only a tube has, and what an effect that needs them acts on
 COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
 
 
@@ -80,35 +80,28 @@ class CandidateShape:
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, Remark]]:
-    """Candidates that these trials can test, and for the others the reason why not. Returns testable, reasons (why each
-    of the others cannot be tested, by name).
-    """
-    tube_only_columns = ("chamber_l", "inlet_mm", "yield_pressure_kPa")
-    can_act: list[Effect] = []
-    reasons: dict[str, Remark] = {}
-    no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
-    for effect in candidates:
-        if no_tube and (absent := [column for column in effect.needs if column in tube_only_columns]):
-            reasons[effect.name] = remark("no_tube", column=absent[0])
-            continue
-        if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
-            reasons[effect.name] = remark("in_measured_pressure")
-            continue
-        if "trace_time" in effect.functions and all(trial_data.trace is None for trial_data in data):
-            reasons[effect.name] = remark("no_measured_pressure")
-            continue
-        if absent := [
-            column for column in effect.needs if not any(stated(column, trial_data.trial) for trial_data in data)
-        ]:
-            reasons[effect.name] = remark(COLUMN_BLANK, column=absent[0])
-            continue
-        try:
-            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
-        except EffectError:
-            reasons[effect.name] = remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
-            continue
-        can_act.append(effect)
-    return tuple(can_act), reasons
+    """Candidates that these trials can test, and the reason why not by name of each of the others."""
+    reasons = {effect.name: why for effect in candidates if (why := _untestable(effect, data))}
+    return tuple(effect for effect in candidates if effect.name not in reasons), reasons
+
+
+def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
+    """The reason why these trials cannot test an effect; blank where they can."""
+    trials, has_trace = [trial_data.trial for trial_data in data], [trial_data.trace is not None for trial_data in data]
+    of_tube = [column for column in effect.needs if column in ("chamber_l", "inlet_mm", "yield_pressure_kPa")]
+    if of_tube and all(trial.travel_ratio == 1 for trial in trials):
+        return remark("no_tube", column=of_tube[0])
+    if effect.in_trace and all(has_trace):
+        return remark("in_measured_pressure")
+    if "trace_time" in effect.functions and not any(has_trace):
+        return remark("no_measured_pressure")
+    if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
+        return remark(COLUMN_BLANK, column=absent[0])
+    try:
+        check_needs(Model((effect,)), *trials)
+    except EffectError:
+        return remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
+    return Remark()
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
@@ -176,27 +169,23 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     return tuple((low + fraction * (high - low)) for fraction in (0.15, 0.5, 0.85))
 
 
-def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0) -> tuple[float, str] | None:
-    """Find the common slip in the sheet that would produce a fitted size, up to an ordinary error. Returns (float, str)
-    or None: Size that the slip produces, and what was done; None where no slip fits.
+def slip_of(parameter: Parameter, value: float, sigma: float) -> tuple[float, str] | None:
+    """The size that a common slip in the sheet produces, and what was done, where a fitted size is that up to an
+    ordinary error; None where no slip fits.
     """
     if parameter.plausible is None:
         return None
     low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
     for size, action in parameter.slips:
-        remaining, margin = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
+        remaining, margin = (1 + value) / (1 + size) - 1, REACH_SIGMAS * sigma / (1 + size)
         if low - margin <= remaining <= high + margin:
             return size, action
     return None
 
 
-def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, within `reach` standard errors of it, or is that of a slip."""
-    if (
-        parameter.plausible is None
-        or value == parameter.zero
-        or slip_of(parameter, value, sigma, reach=reach) is not None
-    ):
+def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: float = 1.0) -> bool:
+    """Whether a value lies in the plausible range, within its error of it, or is that of a slip."""
+    if parameter.plausible is None or value == parameter.zero or slip_of(parameter, value, sigma) is not None:
         return True
     low, high = parameter.plausible
     if math.isfinite(parameter.period):
@@ -205,7 +194,7 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
         # 3.0: factor by which a size may lie below a range that is not narrow (chosen)
         low /= 3.0
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
-    margin = reach * sigma if math.isfinite(sigma) else math.inf
+    margin = REACH_SIGMAS * sigma if math.isfinite(sigma) else math.inf
     return bool(low - margin <= value <= high + margin)
 
 
@@ -219,12 +208,12 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
 
 @dataclass(frozen=True)
 class EffectSensitivities:
-    """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size. `silent`
-    names the effects to which no trajectory responds at any plausible size.
+    """Changes of the positions of each trial, in the order of `shapes`, per unit of each size. `silent` names the
+    effects to which no trajectory responds at any plausible size.
     """
 
     shapes: tuple[CandidateShape, ...]
-    columns: list[Floats]
+    columns: list[list[Floats]]
     silent: tuple[str, ...]
 
     @property
@@ -250,18 +239,8 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
             responding = [each for shape in finite if (each := _sensitivity(fit, shape, baseline)) is not None]
         responses += responding
         detected |= {name} if responding else set()
-    columns = [_columns_of_trial(responses, i, trajectory.time_s.size) for i, trajectory in enumerate(baseline)]
-    return EffectSensitivities(
-        tuple(shape for shape, _ in responses), columns, tuple(name for name in names if name not in detected)
-    )
-
-
-def _columns_of_trial(responses: Sequence[tuple[CandidateShape, list[Floats]]], i: int, points: int) -> Floats:
-    """Columns of one trial, shape (n_points, n_shapes). The list entries are released, to save memory."""
-    columns = np.empty((points, len(responses)))
-    for k, (_, columns_of_trials) in enumerate(responses):
-        columns[:, k], columns_of_trials[i] = columns_of_trials[i], np.empty(0)
-    return columns
+    silent = tuple(name for name in names if name not in detected)
+    return EffectSensitivities(tuple(shape for shape, _ in responses), [moved for _, moved in responses], silent)
 
 
 def _sensitivity(
@@ -375,14 +354,15 @@ class Products:
 
 
 def products_of(fit: Fit, sensitivities: EffectSensitivities, systematics: Systematics) -> Products:
-    """Assemble the columns of a fit, of its systematic errors and of the candidates. Afterwards the columns of
-    `sensitivities` are views of those made here, so that no trial's are held twice.
+    """Assemble the columns of a fit, of its systematic errors and of the candidates, which `sensitivities` lose: no
+    trial's are held twice.
     """
     of_fit, problem = systematics.beside(fit.solution.columns), systematics.among(fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):
-        assembled.append(np.column_stack([columns_of_trial, sensitivities.columns[i]]))
-        sensitivities.columns[i] = assembled[-1][:, columns_of_trial.shape[1] :]
+        assembled.append(np.column_stack([columns_of_trial, *(moved[i] for moved in sensitivities.columns)]))
+        for moved in sensitivities.columns:
+            moved[i] = np.empty(0)
     return Products(tuple(assembled), fit.predictor.data, problem, len(sensitivities.shapes))
 
 
@@ -512,24 +492,22 @@ def levers_of(fit: Fit, products: Products) -> Floats:
     return np.asarray(projected(fit, products, fit.state).lever[: len(free)] * np.array(derivatives)[:, None])
 
 
-def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
-    """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`."""
-    projection = projected(fit, products, state or fit.state)
-    blocks, places, p = projection.blocks, products.problem.index, products.n_unknowns
+def scores_of(fit: Fit, products: Products) -> Scores:
+    """Compute the scores at a fit."""
+    projection = projected(fit, products, fit.state)
+    count, p = products.n_shapes, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
     # the scatter of trials: the residuals are those of the fit.
-    none = np.zeros((1, products.n_shapes))
-    lever, lever_of_fit = np.vstack([projection.lever, none]), np.vstack([projection.lever_of_fit, none])
+    lever, lever_of_fit = np.pad(projection.lever, ((0, 1), (0, 0))), np.pad(projection.lever_of_fit, ((0, 1), (0, 0)))
     step = np.append(projection.step_of_fit, 0.0)
-    trial_scores = np.empty((len(blocks), products.n_shapes))
-    trial_informations = np.empty((len(blocks), products.n_shapes, products.n_shapes))
-    for part in products.parts:
-        of_part, lever_of_part, moved = blocks[part], lever[places[part]], lever_of_fit[places[part]]
-        residual = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[places[part]])
-        trial_scores[part] = residual[:, C] - np.einsum("nk,nks->ns", residual[:, X], lever_of_part)
-        trial_informations[part] = of_part[:, C, C] - of_part[:, C, X] @ moved
-        trial_informations[part] -= np.swapaxes(lever_of_part, 1, 2) @ (of_part[:, X, C] - of_part[:, X, X] @ moved)
+    trials = len(projection.blocks)
+    trial_scores, trial_informations = np.empty((trials, count)), np.empty((trials, count, count))
+    for i, (block, places) in enumerate(zip(projection.blocks, products.problem.index, strict=True)):
+        moved, own = lever_of_fit[places], lever[places]
+        residual = block[:, r] - block[:, X] @ step[places]
+        trial_scores[i] = residual[C] - residual[X] @ own
+        trial_informations[i] = block[C, C] - block[C, X] @ moved - own.T @ (block[X, C] - block[X, X] @ moved)
     trial_scores[:, projection.empty] = 0.0
     groups = coarsest_groups([trial.trial for trial in fit.trials])
     return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)

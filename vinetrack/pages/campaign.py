@@ -16,7 +16,7 @@ import numpy as np
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.ladder import rms_of
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
@@ -217,11 +217,7 @@ def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
         data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
     predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
     members = {name: [predicted[i] for i in campaign.indices_of_condition(name)] for name in campaign.conditions}
-    errors_m = {}
-    for name, trials in members.items():
-        squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
-        errors_m[name] = math.sqrt(float(np.mean(squares)))
-    return Prediction(tuple(predicted), errors_m)
+    return Prediction(tuple(predicted), {name: rms_of(trials) for name, trials in members.items()})
 
 
 def overall_m(errors: Mapping[str, float]) -> float:

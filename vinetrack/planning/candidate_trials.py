@@ -317,8 +317,6 @@ def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> list[tup
     """Job and trajectory of trials that are released at time and position 0, as the fit predicts them; None for those
     that cannot be simulated, found by bisection.
     """
-    if not blanks:
-        return []
     predictor, _, state = extended(fit, blanks)
     state.trial_effects[len(fit.trials) :] = 0.0
     jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
@@ -339,7 +337,8 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     if not conditions:
         return []
     fit, (rest_frames, longest_s) = fits[-1], filming(fits[-1])
-    grid_s = np.linspace(0.0, longest_s, 400)
+    # Fine at the start, where a quick vine has its whole growth
+    grid_s = longest_s * np.linspace(0.0, 1.0, 1000) ** 2
     runs = [_courses(each, [(one, blank_film(fit, one, grid_s)) for one in conditions]) for each in fits]
     # The largest ratio of tail speed to steady speed among the trials so far
     made = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
@@ -350,34 +349,23 @@ def filmed(fits: Sequence[Fit], conditions: Sequence[Condition]) -> list[tuple[C
     ]
     # 1.05: the ratio above which the model predicts compression in the tail (chosen)
     largest_ratio = max(1.05, *filter(math.isfinite, seen))
-    blanks = []
+    films = []
     for condition, *courses in zip(conditions, *runs, strict=True):
         trial, moving = condition.trial, [moved for _, moved in courses if moved is not None]
         if len(moving) < len(fits):
             continue
-        near_s = _near_end_s(trial, moving)
-        grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
+        near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
+        # When the first of these courses nears the end of the growth, s, or ends
+        near_s = min(float(np.interp(near_m, moved.lead_position_m, moved.time_s)) for moved in moving)
+        grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in moving)
         ratio = _speed_ratio(fit, trial, courses[-1][0], moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = (
             grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * fit.predictor.frames_s[condition.like]
         )
         if grows_enough and (trial.tail_slack == "free" or ratio <= largest_ratio):
-            # Once more on a grid that ends soon after the growth
-            blanks.append((condition, blank_film(fit, condition, np.linspace(0.0, near_s + grid_s[1], grid_s.size))))
-    films = []
-    for (condition, _), *courses in zip(blanks, *(_courses(each, blanks) for each in fits), strict=True):
-        moving = [moved for _, moved in courses if moved is not None]
-        if len(moving) == len(fits):
-            near_s = _near_end_s(condition.trial, moving)
             films.append((condition, _film(fit, condition, near_s, moving[0], rest_frames)))
     return films
-
-
-def _near_end_s(trial: Trial, courses: Sequence[Trajectory]) -> float:
-    """When the first of these courses nears the end of the growth, s, or ends."""
-    near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
-    return min(float(np.interp(near_m, course.lead_position_m, course.time_s)) for course in courses)
 
 
 def _film(fit: Fit, condition: Condition, near_s: float, course: Trajectory, rest_frames: int) -> FitTrial:
