@@ -76,7 +76,6 @@ def _correct_timing(track: Track) -> Track:
         note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
         out = out.flagged([int(before) + 1], "gap", note)
     noise_m, rho = _noise(out)
-    out = _retime_known_copies(out, step_s, noise_m, rho)
     checked_to = 0
     while (fault := _next_fault(out, checked_to, step_s, noise_m, rho)) is not None:
         out = _correct_fault(out, fault, step_s)
@@ -115,24 +114,6 @@ def _noise(track: Track) -> tuple[Floats, float]:
         around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS)
         noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
     return noise_m, rho
-
-
-def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: float) -> Track:
-    """Move later times back behind repeated pictures, where the motion says that they were inserted. A repeated picture
-    shows that a frame is a copy, not whether it took the place of another.
-    """
-    for row in np.flatnonzero(with_flag(track.flag, "duplicate")):
-        with_copy = track.usable
-        with_copy[row] = bool(np.isfinite(track.lead_position_m[row]))
-        rows = np.flatnonzero(with_copy)
-        i = int(np.searchsorted(rows, row)) - 1
-        if not with_copy[row] or i < 0:
-            continue
-        frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-        fault = _repeated_frame(frame, track.lead_position_m[rows], i, noise_m[rows[i]], rho, rows)
-        if fault is not None and fault.kind == "inserted":
-            track = _correct_fault(track, fault, step_s)
-    return track
 
 
 def _frames_are(frames: int) -> str:

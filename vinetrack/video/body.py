@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
+from vinetrack.tracks.position_noise import rough_noise
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip
@@ -82,21 +83,11 @@ def track_body(strip: Strip) -> Positions:
 
 
 def hops_between_bodies(along: Floats, seen: Bools) -> bool:
-    """Whether places scatter about any smooth motion by as much as they advance. Fourth differences cancel a cubic
-    motion, and have 70 times the variance of single places. Shapes: along, seen (n_frames,).
-    """
-    if len(along) < 5:
-        return False
-    windows = np.lib.stride_tricks.sliding_window_view
-    complete = windows(seen & np.isfinite(along), 5).all(axis=1)
-    # 3.0, 0.5, 5: roughness, as the standard deviation of single places, in px and in steps of a frame, above
-    # which what is followed is not one body; and the fewest fourth differences from which it is estimated
-    # (chosen)
-    if complete.sum() < 5:
-        return False
-    stretches = windows(along, 5)[complete]
-    noise = 1.4826 * float(np.median(np.abs(stretches @ np.array([1.0, -4.0, 6.0, -4.0, 1.0])))) / np.sqrt(70)
-    return bool(noise > max(3.0, 0.5 * float(np.median(np.abs(np.diff(stretches, axis=1))))))
+    """Whether places scatter about any smooth motion by as much as they advance. Shapes: along, seen (n_frames,)."""
+    places = along[seen & np.isfinite(along)]
+    # 3.0, 0.5, 9: scatter of single places, in px and in steps of a frame, above which what is followed is not one
+    # body; and the fewest places from which it is estimated (chosen)
+    return len(places) >= 9 and rough_noise(places) > max(3.0, 0.5 * float(np.median(np.abs(np.diff(places)))))
 
 
 def _is_absent(

@@ -22,12 +22,9 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
-from vinetrack.core.threads import njit
 
 if TYPE_CHECKING:
     import av
-
-    from vinetrack.video.strip import Strip
 
 
 # ------------------------------------------------------------------------------
@@ -238,7 +235,7 @@ def quiet_log() -> Iterator[list[str]]:
 
 
 # ------------------------------------------------------------------------------
-# Detect pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies.
+# Detect pictures that are not what the camera saw at their time: torn ones, and odd ones at the beginning.
 
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
@@ -288,48 +285,6 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     for i in range(3):
         odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
     return odd
-
-
-def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
-    """Frames in which the surroundings of the edge repeat those of the frame before. The change of the picture is
-    compared with that where the edge moves, and the edge must stand still between frames that show it moving on.
-    Shapes: edge_px (n_frames,) → (n_frames,).
-    """
-    around_px = 40  # Columns on either side of the edge that are compared (chosen)
-    clear_step_px = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
-    n, _, columns = strip.values.shape
-    seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
-    low = np.clip(seen_px - around_px, 0, columns - 1).astype(int)
-    high = np.maximum(np.clip(seen_px + around_px, 1, columns).astype(int), low + 1)
-    change = np.where(np.isfinite(edge_px), _changes_between(strip.values, low, high) * strip.scale, np.inf)
-    moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > clear_step_px / 2
-    median_change = float(np.median(change[moving])) if moving.any() else np.inf
-    repeated = np.zeros(n, dtype=bool)
-    for i in range(2, n - 1):
-        mean_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        # 0.1, 0.15: A copy moves less than this part of a step, and its picture changes by less than this
-        # part of the median (chosen)
-        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * mean_step
-        repeated[i] = mean_step > clear_step_px and stands and change[i] < 0.15 * median_change
-    return repeated
-
-
-@njit(nogil=True)
-def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
-    The first has none before it: infinity.
-    """
-    n, rows, _ = values.shape
-    out = np.full(n, np.inf)
-    for t in range(1, n):
-        total = np.int64(0)
-        for u in range(0, rows, 2):
-            before, after = values[t - 1, u, low[t] : high[t]], values[t, u, low[t] : high[t]]
-            for s in range(len(before)):
-                total += abs(np.int32(after[s]) - np.int32(before[s]))
-        out[t] = total / ((rows + 1) // 2 * (high[t] - low[t]))
-    return out
 
 
 DECODER_THREADS = 2  # Decoder threads per recording (chosen)

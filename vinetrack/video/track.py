@@ -17,7 +17,7 @@ from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import curve_problem, find_growth_axis
 from vinetrack.video.edge import EdgeTracker
-from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
@@ -200,10 +200,8 @@ def track_pixels(
     random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
-    quality = assess_points(
-        followed.edge_px, total_px, number, unsure=followed.unsure,
-        repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
-    )  # fmt: skip
+    end_px = strip.axis.length_px - followed.reach_px
+    quality = assess_points(followed.edge_px, total_px, number, unsure=followed.unsure, end_px=end_px)
     if quality.last_moving < 0:
         # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
         if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
@@ -275,7 +273,7 @@ def _notes(
         notes.append(f"{name}: the body {why}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
-        ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
+        ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
     axis = followed.strip.axis
     if axis.bends and not axis_given:
         notes.append(
@@ -345,10 +343,8 @@ def in_metres(
     """A tracking in pixels with hand corrections, positions and errors in metres, times corrected for dropped and
     inserted frames, and notes on its end where that is not the end of the vine. Shapes: position_m (n, 2).
     """
-    ending, length_px = tracking.ending, trial.length_m / m_per_px
-    notes = [*tracking.track.notes]
-    notes[ending.place : ending.place] = ending.notes(length_px)
-    track = corrected_by_hand(replace(tracking.track, notes=tuple(notes)), trial.corrections)
+    notes = (*tracking.track.notes, *tracking.ending.notes(trial.length_m / m_per_px))
+    track = corrected_by_hand(replace(tracking.track, notes=notes), trial.corrections)
     position = track.edge_px * m_per_px
     local_m_per_px: Floats | float = m_per_px
     if position_m is not None:
