@@ -278,6 +278,15 @@ def rest_points(position_m: Floats) -> int:
     return best + 1 if best > 0 else 0
 
 
+def turning_point(position: Floats, back: Floats | float) -> int | None:
+    """Furthest point of a motion that turns back, behind which two points in a row then lie by more than `back`; None
+    where there is none. Shapes: position (n,).
+    """
+    is_back = np.maximum.accumulate(position) - position > back
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
+    return int(np.argmax(position[: turned[0] + 1])) if turned.size else None
+
+
 def _stretches(time_s: Floats, position_m: Floats, length: int, order: int) -> tuple[Floats, Floats]:
     """Positions cut into stretches, shape (s, m), and the polynomial basis of each in its time, (s, m, order + 1)."""
     n = position_m.size

@@ -266,11 +266,8 @@ def _notes(
     name = frames.recording.path.name
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
-        frame, turns_back = int(number[followed.end[0]]), followed.end[1]
-        why = f"is not recognised after frame {frame}: it is gone, hidden or turned over"
-        if turns_back:
-            why = f"turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
-        notes.append(f"{name}: the body {why}")
+        why = f"turns back after frame {number[followed.end]}: a bounce, or the end of its motion"
+        notes.append(f"{name}: the body {why}; later frames are not used")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
