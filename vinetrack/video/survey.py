@@ -91,7 +91,7 @@ def measure_recording(
     rel_sigma, position_m = math.nan, None
     if calibration is not None:
         bent = tracking.axis.bends and math.isfinite(tracking.tube_width_sigma_px)
-        along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
+        along = calibration.along(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = in_metres(tracking, trial, m_per_px, position_m)
     # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
