@@ -235,34 +235,7 @@ def quiet_log() -> Iterator[list[str]]:
 
 
 # ------------------------------------------------------------------------------
-# Detect pictures that are not what the camera saw at their time: torn ones, and odd ones at the beginning.
-
-
-def torn_frames(luma: NDArray[Any]) -> Bools:
-    """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data. A front
-    that passes leaves a block between its values before and after; a tear lies outside both. Shapes: luma (n_frames,
-    height, width) → (n_frames,).
-    """
-    torn_block_px, torn_run = 16, 12  # Side of the blocks that are compared (derived)
-    n, height, width = luma.shape
-    rows, columns = height // torn_block_px, width // torn_block_px
-    if n < 6 or rows == 0 or columns < torn_run:
-        return np.zeros(n, dtype=bool)
-    cropped = luma[:, : rows * torn_block_px, : columns * torn_block_px]
-    grid = (rows, torn_block_px, columns, torn_block_px)
-    block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cropped])
-    block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
-    excess = np.zeros_like(block)
-    place = np.arange(n)
-    for gap in (1, 2):  # two torn frames in a row are compared with those around both
-        before = np.where(place >= gap, place - gap, place + 2 * gap)
-        after = np.where(place + gap < n, place + gap, place - 2 * gap)
-        low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
-        excess = np.maximum(excess, np.maximum(block - high, low - block))
-    unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
-    # 4.0, 4.0: distance of a block outside them (chosen)
-    limit = 4.0 * unit + 4.0 * np.quantile(excess, 0.75, axis=0)
-    return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= torn_run)
+# Detect pictures that are not what the camera saw at their time: odd ones at the beginning.
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
@@ -502,8 +475,6 @@ def _read_film(recording: Recording, part: tuple[int, int] | None, index: Packet
             "from the camera again"
         )
     frames = frames_at(recording, decoded.pictures, ticks, number, lost=max(declared - len(ticks), 0))
-    if decoded.decoder in NON_MARKING_DECODERS:
-        decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()
     damaged = damaged_frames(decoded, frames.slot)
     if decoded.messages or damaged.any():
         first_message = f"; the first: {decoded.messages[0].strip()}" if decoded.messages else ""
