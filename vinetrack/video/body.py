@@ -84,7 +84,7 @@ def track_body(strip: Strip) -> Positions:
         )
     return Positions(
         strip=strip, edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error,
-        unsure=~inside | (match < POOR_MATCH), blur_px=float(half), reach_px=float(half), slow_px=SLOW_PX, end=end,
+        unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
     )  # fmt: skip
 
 

@@ -58,7 +58,6 @@ class Positions:
     edge_px: Floats
     sigma_px: Floats
     unsure: Bools
-    blur_px: float
     reach_px: float
     slow_px: Floats | float
     exposure_frames: float = math.nan

@@ -65,7 +65,7 @@ class ArrivalTracker:
         # 0.8, 1.0: random and slow error of an arrival (measured)
         return Positions(
             strip=strip, edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool),
-            blur_px=1.0, reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
+            reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
         )  # fmt: skip
 
 
@@ -132,29 +132,23 @@ STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the st
 
 @dataclass(frozen=True)
 class Tracking:
-    """A track and what a figure of it needs. `kymograph`, shape (n_frames, n_along), is the strip's brightness averaged
-    across, in grey levels; column j lies `j` px from `axis.from_px`, and `edge_px` of the track counts from the same
-    point.
+    """A track and what a figure of it needs. `kymograph`, shape (n_rows, n_along), is the strip's brightness averaged
+    across, in grey levels; `strip_rows`, shape (n_rows,), are the frames of its rows. Column j lies `j` px from
+    `axis.from_px`, and `edge_px` of the track counts from the same point.
     """
 
     track: Track
     axis: Axis
     kymograph: NDArray[np.float32]
+    strip_rows: Indices
     pictures: tuple[tuple[int, NDArray[Any]], ...]
-    blur_px: float
     exposure_frames: float
     shake_px: Floats
     tube_width_px: float = math.nan
     tube_width_sigma_px: float = math.nan
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
-    strip_frames: Indices | None = None
     ending: Ending = field(default_factory=Ending)
-
-    @property
-    def strip_rows(self) -> Indices:
-        """Frame of each row of `kymograph`, shape (n_rows,)."""
-        return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
 
 
 def track_recording(trial: Trial, axis: Axis | None = None) -> Tracking:
@@ -223,9 +217,8 @@ def track_pixels(
     shake_px = np.zeros(frames.n_recorded)
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
-        track, strip.axis, kymograph.astype(np.float32), pictures, followed.blur_px, followed.exposure_frames, shake_px,
-        followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame,
-        strip_frames=number, ending=ending,
+        track, strip.axis, kymograph.astype(np.float32), number, pictures, followed.exposure_frames, shake_px,
+        followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame, ending,
     )  # fmt: skip
 
 
