@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, askew_trials, axis_through, slope_deg
+from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.curved_axis import axis_entry, curve_problem, find_growth_axis
 from vinetrack.video.edge import tube_strip
@@ -258,47 +258,6 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
         message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy,
         of_a_measurement=True,
     )  # fmt: skip
-
-
-def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
-    """Note where growth in the picture runs in another direction than in the sheet; no fault, since cameras are turned.
-    That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
-    straight down and that runs level.
-    """
-    steep_deg = 60.0  # Angle between growth and the picture's rows above which growth runs up or down (chosen)
-    upright, level = [], []
-    for fact, trial in zip(facts, trials, strict=True):
-        if fact.axis is None or fact.axis.bends or trial.travel_ratio == 1:
-            continue
-        right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
-        slope_deg = math.degrees(math.atan2(down, right))
-        from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
-        upright += [trial.name] if slope_deg > steep_deg and from_level_deg < 90 - steep_deg else []
-        level += [trial.name] if slope_deg < 90 - steep_deg and trial.name in blank else []
-    findings = (
-        (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
-        (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
-    )
-    return [f"growth runs {way} in the picture ({_named(who)}) and {remark}" for who, way, remark in findings if who]
-
-
-def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Name recordings whose axis was found askew to that of most others that grow at the same angle. Something else
-    that moves, such as a door as long as the growth, was then taken for the tube.
-    """
-    axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
-    slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
-    return [
-        f"a growth axis other than that of {n_agreeing} recordings was found ({_named(names)}): where one camera "
-        "filmed them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those "
-        "(column `axis`)"
-        for names, n_agreeing in askew_trials(slopes_deg, trials)
-    ]
-
-
-def _named(names: list[str]) -> str:
-    """One name, or how many recordings and the first of them."""
-    return names[0] if len(names) == 1 else f"{len(names)} recordings, {names[0]} first"
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
