@@ -38,8 +38,8 @@ DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of eac
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
 
-class CornersError(ValueError):
-    """A picture in which the target cannot be read: what is wrong and what to do, in one sentence."""
+class CalibrationError(RecordingError):
+    """A calibration that cannot be made; of a picture in which the target cannot be read, in one sentence."""
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
@@ -94,16 +94,16 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
     raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
 
 
-def _not_as_stated(picture: NDArray[Any], found: str) -> CornersError:
+def _not_as_stated(picture: NDArray[Any], found: str) -> CalibrationError:
     """The error of a picture that does not show the board of the settings: what was found, and what it shows."""
     seen = find_board(picture)
     if seen is None:
-        return CornersError(
+        return CalibrationError(
             f"{found}; the board with a white border must be in the picture, in focus, evenly lit, not mirrored and "
             "larger than 5 pixels a marker bit, and `squares` counts squares, not inner corners"
         )
     markers = f" with markers of {seen.dictionary}, {seen.marker_share:.2g} of a square wide" if seen.dictionary else ""
-    return CornersError(
+    return CalibrationError(
         f"{found}, but a {seen.kind} of {seen.squares[0]} × {seen.squares[1]} squares{markers}; correct `calibration`"
     )
 
@@ -145,7 +145,7 @@ def _dictionary(name: str) -> Any:
 
     code = getattr(cv2.aruco, name, None)
     if code is None:
-        raise CornersError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
+        raise CalibrationError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
     return cv2.aruco.getPredefinedDictionary(code)
 
 
@@ -213,7 +213,7 @@ def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floa
         if min(len(np.unique(grid_m[:, k])) for k in (0, 1)) > 1:
             return corners_px, grid_m
         seen = "they lie on one line"
-    raise CornersError(
+    raise CalibrationError(
         f"only {len(grid_m)} corners of the board can be read ({seen}; at least {FEWEST_CORNERS}, not on one line, are "
         "needed); show more of it, larger, in focus, evenly lit and not mirrored"
     )
@@ -404,10 +404,6 @@ def _residuals(values: Floats, corners: Floats, board: Floats) -> Floats:
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
 
 
-class CalibrationError(RecordingError):
-    """A calibration that cannot be made."""
-
-
 @dataclass(frozen=True)
 class AxisScale:
     """The calibration along one growth axis. `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative
@@ -519,8 +515,8 @@ def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checke
             else:
                 corners_px, board_m = checkerboard_corners(picture, board)
             break
-        except CornersError as error:
-            complaint = str(error)
+        except CalibrationError as error:
+            complaint = error.message
     else:
         raise CalibrationError(complaint, name=board.image)
     height, width = picture.shape

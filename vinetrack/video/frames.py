@@ -310,14 +310,14 @@ def inspect_recording(path: Path | str) -> Recording:
         raise RecordingError("there is no such file or folder", name=path.name) from None
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", name=path.name) from None
-    from vinetrack.video.images import inspect_camera_file, inspect_images
+    from vinetrack.video.images import inspect_cine, inspect_images, inspect_mraw
 
     if path.is_dir() or path.suffix.lower() in IMAGES:
         return inspect_images(path)
     if size == 0:
         raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     if path.suffix.lower() in CAMERA_FILES:
-        return inspect_camera_file(path)
+        return inspect_cine(path) if path.suffix.lower() == ".cine" else inspect_mraw(path)
     return _inspect_container(path)
 
 
@@ -340,26 +340,22 @@ def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
     luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
+    too_large = RecordingError(
+        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
+        "cut it to the growth, and to the part of the picture that shows it",
+        recording.path.name,
+    )
     if count > most:
-        raise _too_large(recording)
+        raise too_large
     for n, picture in enumerate(pictures, 1):
         if n > most:
-            raise _too_large(recording)
+            raise too_large
         if n == 1:  # untouched memory takes no space
             luma = np.empty((count, *picture.shape), picture.dtype)
         if n > len(luma):
             luma = np.concatenate([luma, np.empty_like(luma[: n // 2 + 1])])
         luma[n - 1] = picture
     return luma[:n]
-
-
-def _too_large(recording: Recording) -> RecordingError:
-    """Make the error for a recording that does not fit in memory."""
-    return RecordingError(
-        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
-        "cut it to the growth, and to the part of the picture that shows it",
-        recording.path.name,
-    )
 
 
 def iterate_frames(recording: Recording) -> Iterator[NDArray[Any]]:

@@ -75,12 +75,7 @@ MARK_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 896, 1568  # Offsets in the settings
 EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
 
-def inspect_camera_file(path: Path) -> Recording:
-    """Read the header of a file of a high-speed camera, by its suffix."""
-    return _inspect_cine(path) if path.suffix.lower() == ".cine" else _inspect_mraw(path)
-
-
-def _inspect_cine(path: Path) -> Recording:
+def inspect_cine(path: Path) -> Recording:
     """Read the header of a Phantom `.cine`."""
     name = path.name
     try:
@@ -197,7 +192,7 @@ def _cine_clock(
     return rate or None, exposure_s or None, times_s, tuple(notes)
 
 
-def _inspect_mraw(path: Path) -> Recording:
+def inspect_mraw(path: Path) -> Recording:
     """Read the side file of a Photron `.mraw`."""
     data = next(iter(_siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)

@@ -394,19 +394,16 @@ def _frames_present(recording: Recording) -> int | None:
     import av
 
     size = recording.path.stat().st_size
-    try:
-        with av.open(str(recording.path)) as container:
-            stream = container.streams.video[0]
-            entries = stream.index_entries
-            if stream.frames and len(entries) >= stream.frames:
-                return sum(entry.pos + entry.size <= size for entry in entries)
-            # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
-            if size > 64_000_000:
-                return None
+    # Damage that the walk meets decoding will report.
+    with contextlib.suppress(av.error.FFmpegError, AttributeError), av.open(str(recording.path)) as container:
+        stream = container.streams.video[0]
+        entries = stream.index_entries
+        if stream.frames and len(entries) >= stream.frames:
+            return sum(entry.pos + entry.size <= size for entry in entries)
+        # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
+        if size <= 64_000_000:
             return sum(1 for packet in container.demux(stream) if packet.size)
-    except (av.error.FFmpegError, AttributeError):
-        # The walk met damage, which decoding will report.
-        return None
+    return None
 
 
 def _scale_problems(
