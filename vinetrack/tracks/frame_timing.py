@@ -186,7 +186,7 @@ def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     # The step back after an inserted copy must be significant.
     if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > 3.5 * sigma:
         without = np.delete(frame, i + 1), np.delete(y, i + 1)
-        if -_wide_jump(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
+        if -_wide_jump(*without, i, noise_m) < LEAST_SHARE * step:
             return None
         return _Fault("inserted", int(rows[i + 1]))
     return None
@@ -224,8 +224,8 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
     return None
 
 
-def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
-    """Jump between points i and i + 1 from many more points on either side, ±∞ where those are inconclusive. They are
+def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float) -> float:
+    """Jump between points i and i + 1 from many more points on either side, NaN where those are inconclusive. They are
     conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few nearby
     outliers made up is then gone.
     """
@@ -234,11 +234,11 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) 
     t, points = (frame[near] - frame[i]) / WIDE_SIDE_POINTS, y[near]
     before = i + 1 - first
     if min(before, t.size - before) < 2 * SIDE_POINTS[0]:
-        return sign * math.inf
+        return math.nan
     basis = np.column_stack([np.ones(t.size), t, t**2, t**3, np.arange(t.size) >= before])
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
-    return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
+    return float(fit[4]) if misfit_m < 2.5 * noise_m else math.nan
 
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
