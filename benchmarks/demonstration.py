@@ -104,7 +104,7 @@ def compare(name: str, measured: Measurement, truth: Truth) -> Row:
 def _length(measured: Measurement, start_px: np.ndarray, end_px: np.ndarray) -> float:
     assert measured.calibration is not None
     axis = measured.tracking.axis
-    position_m = measured.calibration.along(axis.from_px, axis.to_px).position_m(np.stack([start_px, end_px]))
+    position_m = measured.calibration.along(axis).position_m(np.stack([start_px, end_px]))
     return float(position_m[1] - position_m[0])
 
 

@@ -225,9 +225,8 @@ def tracking(n_along: int = 300, height: int = 60) -> Tracking:
     picture = np.full((height, n_along), 128, np.uint8)
     track = Track(np.arange(COUNT) / 1000, edge * 1e-3, np.full(COUNT, 1e-5), flag, edge)
     pictures = ((10, picture), (25, picture), (39, picture))
-    return Tracking(
-        track, Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), kymograph, pictures, 1.0, 0.1, np.zeros(COUNT)
-    )
+    axis, rows = Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), np.arange(COUNT)
+    return Tracking(track, axis, kymograph, rows, pictures, 0.1, np.zeros(COUNT))
 
 
 def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was():

@@ -11,6 +11,7 @@ from plain_scene import write_video
 from vinetrack.experiment.settings import Charuco, Checkerboard, TwoPoints
 from vinetrack.laboratory.filming import render_target
 from vinetrack.laboratory.scene import Camera, Target, preset
+from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures, find_board, fit_plane
 
 DEMO = preset("demo")
@@ -41,7 +42,7 @@ AXIS = ((120.0, 150.0), (840.0, 175.0))
 
 def scale_error(found, camera: Camera = CAMERA, ends=AXIS) -> tuple[float, float]:
     """Relative error of the scale along an axis, and the error it states."""
-    axis = found.along(*ends)
+    axis = found.along(Axis(*ends))
     return axis.m_per_px * math.dist(*ends) / true_length_m(camera, ends) - 1, axis.scale_rel_sigma
 
 
@@ -125,7 +126,7 @@ def test_a_small_target_states_a_larger_error():
     wide = calibrate_pictures([picture()], stated())
     narrow = calibrate_pictures([picture(small)], stated(small))
     far = ((500.0, 160.0), (900.0, 160.0))
-    assert narrow.along(*far).scale_rel_sigma > 5 * wide.along(*far).scale_rel_sigma
+    assert narrow.along(Axis(*far)).scale_rel_sigma > 5 * wide.along(Axis(*far)).scale_rel_sigma
     error, sigma = scale_error(narrow, ends=far)
     assert abs(error) < 3 * sigma
     assert narrow.notes
@@ -142,13 +143,13 @@ def test_of_a_moved_target_the_first_picture_shows_the_plane(tmp_path):
     error, sigma = scale_error(found)
     assert abs(error) < min(1e-3, 3 * sigma)
     alone = calibrate_pictures([picture(seed=2002)], stated())
-    assert found.along(*AXIS).scale_rel_sigma < 1.2 * alone.along(*AXIS).scale_rel_sigma
+    assert found.along(Axis(*AXIS)).scale_rel_sigma < 1.2 * alone.along(Axis(*AXIS)).scale_rel_sigma
 
 
 def test_two_points_and_a_length(tmp_path):
     settings = TwoPoints(kind="two_points", from_px=(100, 50), to_px=(400, 450), length_mm=250)
     found = calibrate(settings, tmp_path, 960, 540)
-    axis = found.along((10, 20), (10, 520))
+    axis = found.along(Axis((10, 20), (10, 520)))
     assert axis.m_per_px == pytest.approx(0.5e-3)
     assert axis.scale_rel_sigma == pytest.approx(math.sqrt(2) * 0.5 / 500)
     assert axis.position_m(np.array([[10, 20], [200, 120], [10, 520]])) == pytest.approx([0, 0.05, 0.25])

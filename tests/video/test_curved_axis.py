@@ -94,23 +94,23 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane():
     parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
     plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
-    calibration = PlaneCalibration("charuco", plane, 0.1, 50, 1, 0.0, (0, 0, 639, 639))
+    calibration = PlaneCalibration("charuco", plane, 0.1, 50, 0.0, (0, 0, 639, 639))
     trial = Trial(name="t", exposure_s=bent.plan.exposure / 1000)
     in_px = track_pixels(in_memory(bent.frames), trial, 1000.0, drawn(bent))
     axis = in_px.axis
-    scale = calibration.along_path(axis)
+    scale = calibration.along(axis)
     tracking = in_metres(in_px, trial, scale.m_per_px, scale.position_m)
     used = bent.moving & tracking.track.usable
     fine = np.arange(0.0, bent.arc_px[-1], 0.5)
     steps = np.linalg.norm(np.diff(plane.plane_m(bent.places(fine)), axis=0), axis=1)
     true_m = np.interp(bent.edge_px, fine, np.concatenate([[0.0], np.cumsum(steps)]))
     assert (tracking.track.lead_position_m[used] - true_m[used]).std() < 0.4 * 1.3e-3
-    chord = calibration.along(axis.from_px, axis.to_px)
+    chord = calibration.along(Axis(axis.from_px, axis.to_px))
     assert 0 < scale.scale_rel_sigma < 0.02
     assert scale.scale_rel_sigma != pytest.approx(chord.scale_rel_sigma, rel=1e-3)
     ends_m = scale.position_m(axis.points(np.array([0.0, axis.length_px])))
     assert scale.m_per_px * axis.length_px == pytest.approx(float(np.ptp(ends_m)))
-    off = calibration.along_path(axis, off_px=0.5).scale_rel_sigma
+    off = calibration.along(axis, off_px=0.5).scale_rel_sigma
     assert off == pytest.approx(math.hypot(scale.scale_rel_sigma, 0.5 * abs(axis.turn_rad) / axis.length_px))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plain_scene import write_video
 
-from vinetrack.core.records import Trial
+from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.filming import render_recording
@@ -19,7 +19,7 @@ from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video import survey as module
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import askew_trials
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.images import capture_rate
 from vinetrack.video.survey import RecordingFacts, Surveyor
@@ -143,32 +143,16 @@ def test_sizes_that_contradict_the_sheet_are_named_once(trial, scale, grown_mm, 
     assert [f"{problem.severity} {problem.column}" for problem in module.size_problems(trial, facts)] == found
 
 
-ACROSS, DOWN = (300.0, 40.0), (75.0, 200.0)
-DIRECTIONS = [(ACROSS, 0, False, False), (DOWN, 0, True, False), (ACROSS, 90, False, False)]
-DIRECTIONS += [(DOWN, 90, False, True), (ACROSS, 0, True, True)]
-
-
-@pytest.mark.parametrize(("to_px", "angle_deg", "blank", "noted"), DIRECTIONS)
-def test_growth_in_another_direction_than_stated_is_noted(to_px, angle_deg, blank, noted):
-    trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
-    facts = replace(FACTS, axis=Axis((60.0, 30.0), to_px))
-    assert len(module.direction_notes([facts] * 2, trials, ["a", "b"] if blank else [])) == noted
-
-
-SLOPES_DEG = [([0, 1, -2, 179, 1], ""), ([0, 1, -2, 60, 1], "d"), ([0, 1, -2, 60, -35], "d first")]
+SLOPES_DEG = [([0, 1, -2, 179, 1], ""), ([0, 1, -2, 60, 1], "d"), ([0, 1, -2, 60, -35], "de")]
 SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
 
 
 @pytest.mark.parametrize(("slopes_deg", "named"), SLOPES_DEG)
 def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg, named):
-    ends = [(100 + 200 * np.cos(np.radians(s)), 100 + 200 * np.sin(np.radians(s))) for s in slopes_deg]
-    named_ends = zip("abcde", ends, strict=False)
-    trials = [replace(VINE, name=name, axis=Axis((100.0, 100.0), end)) for name, end in named_ends]
-    facts = [replace(FACTS, trial=trial.name, axis=trial.axis) for trial in trials]
-    assert module.axis_notes(facts, trials) == []  # it was given
-    notes = module.axis_notes(facts, [replace(trial, axis=None) for trial in trials])
-    assert len(notes) == bool(named)
-    assert all(named in note for note in notes)
+    found, trials = dict(zip("abcde", slopes_deg, strict=False)), [replace(VINE, name=name) for name in "abcde"]
+    given = PictureAxis((0.0, 0.0), (50.0, 0.0))
+    assert askew_trials(found, [replace(trial, axis=given) for trial in trials]) == []
+    assert [name for names, _ in askew_trials(found, trials) for name in names] == list(named)
 
 
 @pytest.fixture(scope="module")

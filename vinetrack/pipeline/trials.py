@@ -121,8 +121,9 @@ def _of_recording(
     seen: dict[str, Any] = {"kind": "sheet", "image": None, **scale}
     if calibration is not None:
         seen |= {"kind": calibration.kind, "image": getattr(experiment.settings.calibration, "image", None)}
-    known: dict[str, Any] = {"reprojection_px": None, "n_corners": 0, "n_pictures": 0, "notes": []}
+    known: dict[str, Any] = {"reprojection_px": None, "n_corners": 0, "notes": []}
     seen |= {name: getattr(calibration, name, blank) for name, blank in known.items()}
+    seen["n_pictures"] = int(seen["n_corners"] > 0)
     axis = axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px}
     axis |= {"shake_px": tracking.shake_px.round(2)} if np.any(tracking.shake_px) else {}
     contradictions = [{"column": problem.column, "reason": problem.reason} for problem in problems]

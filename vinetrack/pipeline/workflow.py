@@ -324,7 +324,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import load_track
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
-    from vinetrack.video.survey import Surveyor, axis_notes, direction_notes, facts_entry, facts_rows
+    from vinetrack.video.survey import Surveyor, facts_entry, facts_rows
 
     surveyor = Surveyor(keep)
     problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor)]
@@ -350,7 +350,6 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     if 0 < len(surveyor.looked_into) < len(entries):
         lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")
     notes = list(experiment.blank_notes)
-    notes += [*direction_notes(entries, trials, experiment.angle_blank), *axis_notes(entries, trials)]
     rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in tracks])
     if smoothing := detect_smoothing(tracks, rounding_m):
         notes.append(smoothing.note)

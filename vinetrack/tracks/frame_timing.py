@@ -5,9 +5,8 @@ copy: the times are right); if it is single, the copy was *inserted* and everyth
 dropped frame shows as one step of double length, and everything after it is one frame early.
 
 A jump is tested against the jump that a smooth motion with the track's own noise could show: by least squares of a
-parabola with a step on the nearest points on both sides. Times are changed only where a single outlier would not
-explain the jump as well and points farther away agree: noise may have heavy tails. Outliers are rejected first
-(`outliers`): a dropped frame displaces all later points, an outlier does not.
+parabola with a step on the nearest points on both sides. An inserted copy counts only where points farther away agree:
+noise may have heavy tails. Outliers are rejected afterwards.
 """
 
 from __future__ import annotations
@@ -35,14 +34,11 @@ WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
 
 
 class _Jump(NamedTuple):
-    """Jump of position between two sides of a smooth motion, its standard error and the step of one frame, m;
-    `by_outlier`: a single outlier explains the points about as well.
-    """
+    """Jump of position between two sides of a smooth motion, its standard error and the step of one frame, m."""
 
     size: float
     sigma: float
     step: float
-    by_outlier: bool
 
 
 @dataclass(frozen=True)
@@ -56,11 +52,11 @@ class _Fault:
 
 def correct_frames(track: Track) -> Track:
     """Flag repeated frames and gaps of a track, and correct its times."""
-    return reject_outliers(_correct_timing(reject_outliers(track, spare_copies=True)))
+    return reject_outliers(_correct_timing(track))
 
 
 def _correct_timing(track: Track) -> Track:
-    """Correct the times of a track without outliers, other than those that may be copies."""
+    """Flag repeated frames and gaps, and correct the times."""
     spacing = np.diff(track.time_s)
     if track.time_s.size < 6 or not np.all(spacing > 0):
         return track
@@ -76,7 +72,6 @@ def _correct_timing(track: Track) -> Track:
         note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
         out = out.flagged([int(before) + 1], "gap", note)
     noise_m, rho = _noise(out)
-    out = _retime_known_copies(out, step_s, noise_m, rho)
     checked_to = 0
     while (fault := _next_fault(out, checked_to, step_s, noise_m, rho)) is not None:
         out = _correct_fault(out, fault, step_s)
@@ -115,24 +110,6 @@ def _noise(track: Track) -> tuple[Floats, float]:
         around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS)
         noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
     return noise_m, rho
-
-
-def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: float) -> Track:
-    """Move later times back behind repeated pictures, where the motion says that they were inserted. A repeated picture
-    shows that a frame is a copy, not whether it took the place of another.
-    """
-    for row in np.flatnonzero(with_flag(track.flag, "duplicate")):
-        with_copy = track.usable
-        with_copy[row] = bool(np.isfinite(track.lead_position_m[row]))
-        rows = np.flatnonzero(with_copy)
-        i = int(np.searchsorted(rows, row)) - 1
-        if not with_copy[row] or i < 0:
-            continue
-        frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-        fault = _repeated_frame(frame, track.lead_position_m[rows], i, noise_m[rows[i]], rho, rows)
-        if fault is not None and fault.kind == "inserted":
-            track = _correct_fault(track, fault, step_s)
-    return track
 
 
 def _frames_are(frames: int) -> str:
@@ -175,7 +152,7 @@ def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
-    size, sigma, step, by_outlier = jump
+    size, sigma, step = jump
     missing = round(size / step)
     long_step = y[i + 1] - y[i]
     if missing < 1 or long_step <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
@@ -184,9 +161,7 @@ def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
     if long_step <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
         return None
-    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or by_outlier:
-        return None
-    if _wide_jump(frame, y, i, noise_m) < LEAST_SHARE * missing * step:
+    if abs(size - missing * step) > max(4 * sigma, 0.3 * step):
         return None
     return _Fault("dropped", int(rows[i + 1]), missing)
 
@@ -196,7 +171,7 @@ def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
-    size, sigma, step, _ = jump
+    size, sigma, step = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
     short_step = y[i + 1] - y[i]
     # A copy stands still to within this part of a step, and the step must be this significant.
@@ -210,10 +185,8 @@ def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float
         return _Fault("stale", int(rows[i + 1]))
     # The step back after an inserted copy must be significant.
     if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > 3.5 * sigma:
-        # After a point one step ahead of its time, the next one lies where a copy would.
-        ahead = i >= 2 and y[i] - y[i - 1] > 1.4 * max(y[i - 1] - y[i - 2], step)
         without = np.delete(frame, i + 1), np.delete(y, i + 1)
-        if ahead or -_wide_jump(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
+        if -_wide_jump(*without, i, noise_m) < LEAST_SHARE * step:
             return None
         return _Fault("inserted", int(rows[i + 1]))
     return None
@@ -239,8 +212,7 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
         weights = np.linalg.pinv(basis)
         fit = weights @ both
-        with_jump = float(np.sum((both - basis @ fit) ** 2))
-        misfit_m = math.sqrt(with_jump / (t.size - 4))
+        misfit_m = math.sqrt(float(np.sum((both - basis @ fit) ** 2)) / (t.size - 4))
         step = float(fit[1])
         # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
         if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
@@ -248,18 +220,12 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         lag = np.abs(np.subtract.outer(t, t))
         correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
         sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
-        # Errors with heavy tails put a point one step ahead or behind now and then; after a jump all later ones are
-        # displaced. A single outlier, which is one parameter too, must leave three times the sum of squares.
-        smooth = basis[:, :3] @ np.linalg.pinv(basis[:, :3])
-        off = both - smooth @ both
-        with_outlier = float(np.sum(off**2) - np.max(off**2 / (1 - np.diagonal(smooth))))
-        by_outlier = with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
-        return _Jump(float(fit[3]), sigma, step, by_outlier)
+        return _Jump(float(fit[3]), sigma, step)
     return None
 
 
-def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
-    """Jump between points i and i + 1 from many more points on either side, ±∞ where those are inconclusive. They are
+def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float) -> float:
+    """Jump between points i and i + 1 from many more points on either side, NaN where those are inconclusive. They are
     conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few nearby
     outliers made up is then gone.
     """
@@ -268,11 +234,11 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) 
     t, points = (frame[near] - frame[i]) / WIDE_SIDE_POINTS, y[near]
     before = i + 1 - first
     if min(before, t.size - before) < 2 * SIDE_POINTS[0]:
-        return sign * math.inf
+        return math.nan
     basis = np.column_stack([np.ones(t.size), t, t**2, t**3, np.arange(t.size) >= before])
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
-    return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
+    return float(fit[4]) if misfit_m < 2.5 * noise_m else math.nan
 
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:

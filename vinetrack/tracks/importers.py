@@ -21,7 +21,7 @@ from vinetrack.core.problems import InputError
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
 from vinetrack.core.units import UNITS, split_unit
-from vinetrack.tracks.position_noise import rest_points, rough_noise
+from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -370,9 +370,7 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
         return track
     noise_m, is_vine, what = rough_noise(y), trial.travel_ratio != 1, "turns back"
     # A body has turned back when it is 8 standard deviations, and 2 % of its travel, behind its furthest place.
-    is_back = np.maximum.accumulate(y) - y > max(8.0 * noise_m, 0.02 * float(np.ptp(y)))
-    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
-    end = int(np.argmax(y[: turned[0] + 1])) if turned.size and not is_vine else None
+    end = None if is_vine else turning_point(y, max(8.0 * noise_m, 0.02 * float(np.ptp(y))))
     if end is None:
         end, what = _stops_dead(y, noise_m), "stops"
     if end is not None and is_vine:

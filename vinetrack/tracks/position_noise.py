@@ -278,6 +278,15 @@ def rest_points(position_m: Floats) -> int:
     return best + 1 if best > 0 else 0
 
 
+def turning_point(position: Floats, back: Floats | float) -> int | None:
+    """Furthest point of a motion that turns back, behind which two points in a row then lie by more than `back`; None
+    where there is none. Shapes: position (n,).
+    """
+    is_back = np.maximum.accumulate(position) - position > back
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
+    return int(np.argmax(position[: turned[0] + 1])) if turned.size else None
+
+
 def _stretches(time_s: Floats, position_m: Floats, length: int, order: int) -> tuple[Floats, Floats]:
     """Positions cut into stretches, shape (s, m), and the polynomial basis of each in its time, (s, m, order + 1)."""
     n = position_m.size
@@ -425,7 +434,7 @@ def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
     return np.asarray(view[middle])
 
 
-def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> Bools:
+def find_outliers(time_s: Floats, position_m: Floats) -> Bools:
     """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
     if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
     (n_points,).
@@ -443,7 +452,7 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
         candidates = np.flatnonzero(~is_outlier)
         if candidates.size < FEWEST_POINTS:
             break
-        outlying_kept = _outlying(time_s[candidates], position_m[candidates], limit, spare_copies)
+        outlying_kept = _outlying(time_s[candidates], position_m[candidates], limit)
         if not outlying_kept.any():
             break
         is_outlier[candidates[outlying_kept]] = True
@@ -451,10 +460,10 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
     return is_outlier if np.mean(is_outlier) <= 0.1 else np.zeros(n, dtype=bool)
 
 
-def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
+def reject_outliers(track: Track) -> Track:
     """Flag the outliers of a track `rejected`, and name them in its notes; points corrected by hand stay."""
     rows = np.flatnonzero(track.usable)
-    is_wild = find_outliers(track.time_s[rows], track.lead_position_m[rows], spare_copies=spare_copies)
+    is_wild = find_outliers(track.time_s[rows], track.lead_position_m[rows])
     outlying = rows[is_wild]
     # A point that a person has placed or confirmed is right.
     outlying = outlying[~with_flag(track.flag[outlying], "corrected")] if outlying.size else outlying
@@ -492,7 +501,7 @@ def _places(track: Track, outlying: Indices) -> list[str]:
     ]
 
 
-def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> Bools:
+def _outlying(time_s: Floats, position_m: Floats, limit: float) -> Bools:
     """Points beyond the limit whose neighbours follow one cubic without them."""
     noise_m, _ = position_noise(time_s, position_m, robust=True)
     fit = local_fit(time_s, position_m, noise_m)
@@ -504,9 +513,6 @@ def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bo
     # Within this many points of an end the motion may have stopped or begun between two frames.
     allowance_m = np.where(from_end < 2, 1.5 * (from_end + 1) * step_m, 0.0)
     isolated = (fit.share >= LEAST_SHARE) & (fit.near >= 3)
-    if spare_copies:
-        # A point nearer than 0.3 steps to the one before may be a repeated frame.
-        isolated[1:] &= np.abs(np.diff(position_m)) >= 0.3 * step_m[1:]
     return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated & (sigma_m > 0))
 
 

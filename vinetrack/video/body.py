@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
+from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip
@@ -40,7 +41,7 @@ def track_body(strip: Strip) -> Positions:
     """Register the moving body of a strip against itself."""
     pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     pictures += strip.offset[:, None, None].astype(np.float32)
-    path, half, background = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
+    path, half = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
     if np.isfinite(strip.axis.width_px):
         # A body is about as long as it is wide; a glint on it is shorter.
         half = max(half, round(0.75 * strip.axis.width_px))
@@ -64,10 +65,16 @@ def track_body(strip: Strip) -> Positions:
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
     off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
     # 0.4: correlation below which the patch found is not the body (chosen)
-    unseen = (match < 0.4) | off_axis | _is_absent(pictures, background, template, weight, place, half)
-    end = _body_end(place[:, 0], error, match, unseen)
-    if end is not None:
-        unseen |= np.arange(len(unseen)) > end[0]
+    unseen = (match < 0.4) | off_axis
+    recognised, end = np.flatnonzero(~unseen & (match >= POOR_MATCH)), None
+    if len(recognised) >= 3:
+        # 3.0, 6.0: distance behind its furthest place at which a body has turned back, in px and in standard errors
+        # (chosen)
+        back_px = np.maximum(3.0, 6.0 * np.nan_to_num(error[recognised], nan=0.0))
+        turned = turning_point(place[recognised, 0], back_px)
+        last = int(recognised[-1 if turned is None else turned])
+        unseen |= np.arange(len(unseen)) > last
+        end = None if turned is None else last
     found = np.flatnonzero(~unseen)
     # 0.5: part of the frames, from the first to the last in which it is seen, that must show a body (chosen)
     hardly_seen = len(found) > 0 and len(found) < 0.5 * (1 + np.ptp(found))
@@ -77,47 +84,16 @@ def track_body(strip: Strip) -> Positions:
         )
     return Positions(
         strip=strip, edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error,
-        unsure=~inside | (match < POOR_MATCH), blur_px=float(half), reach_px=float(half), slow_px=SLOW_PX, end=end,
+        unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
     )  # fmt: skip
 
 
 def hops_between_bodies(along: Floats, seen: Bools) -> bool:
-    """Whether places scatter about any smooth motion by as much as they advance. Fourth differences cancel a cubic
-    motion, and have 70 times the variance of single places. Shapes: along, seen (n_frames,).
-    """
-    if len(along) < 5:
-        return False
-    windows = np.lib.stride_tricks.sliding_window_view
-    complete = windows(seen & np.isfinite(along), 5).all(axis=1)
-    # 3.0, 0.5, 5: roughness, as the standard deviation of single places, in px and in steps of a frame, above
-    # which what is followed is not one body; and the fewest fourth differences from which it is estimated
-    # (chosen)
-    if complete.sum() < 5:
-        return False
-    stretches = windows(along, 5)[complete]
-    noise = 1.4826 * float(np.median(np.abs(stretches @ np.array([1.0, -4.0, 6.0, -4.0, 1.0])))) / np.sqrt(70)
-    return bool(noise > max(3.0, 0.5 * float(np.median(np.abs(np.diff(stretches, axis=1))))))
-
-
-def _is_absent(
-    pictures: NDArray[np.float32], background: NDArray[np.float32], template: NDArray[np.float32],
-    weight: NDArray[np.float32], place: Floats, half: int,
-) -> Bools:  # fmt: skip
-    """Frames in which the background alone explains the patch better than the body does."""
-    absent = np.zeros(len(pictures), dtype=bool)
-    share = weight / float(weight.sum())
-    body_pattern = template - float(np.sum(share * template))
-    power = float(np.sum(share * body_pattern**2)) + 1e-9
-    for t, picture in enumerate(pictures):
-        patch = _patch(picture, place[t, 0], place[t, 1], half)
-        patch = patch - float(np.sum(share * patch))
-        background_residual = patch - _patch(background, place[t, 0], place[t, 1], half)
-        background_residual -= float(np.sum(share * background_residual))
-        gain = float(np.clip(np.sum(share * patch * body_pattern) / power, 0.3, 3.0))
-        body_residual = patch - gain * body_pattern
-        # 0.7: ratio of the background's residual to the template's below which the body is absent (chosen)
-        absent[t] = np.sum(share * background_residual**2) < 0.7 * np.sum(share * body_residual**2)
-    return absent
+    """Whether places scatter about any smooth motion by as much as they advance. Shapes: along, seen (n_frames,)."""
+    places = along[seen & np.isfinite(along)]
+    # 3.0, 0.5, 9: scatter of single places, in px and in steps of a frame, above which what is followed is not one
+    # body; and the fewest places from which it is estimated (chosen)
+    return len(places) >= 9 and rough_noise(places) > max(3.0, 0.5 * float(np.median(np.abs(np.diff(places)))))
 
 
 def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
@@ -129,31 +105,9 @@ def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
     return (1 / (1 + (np.clip(outside, 0, None) / 2.0) ** 2)).astype(np.float32)[:, None]
 
 
-def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: Bools) -> tuple[int, bool] | None:
-    """Last frame of the body's motion along the strip, and whether it turns back there (a bounce) or is not recognised
-    again (it tips over, or is gone); None where the recording ends first.
-    """
-    recognised = np.flatnonzero(~unseen & (match >= POOR_MATCH))
-    if len(recognised) < 3:
-        return None
-    position = along[recognised]
-    behind = np.maximum.accumulate(position) - position
-    # 3.0, 6.0: distance behind its furthest place at which a body has turned back, in px and in standard errors
-    # (chosen)
-    is_back = behind > np.maximum(3.0, 6.0 * np.nan_to_num(sigma[recognised], nan=0.0))
-    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
-    if len(turned):
-        return int(recognised[int(np.argmax(position[: turned[0]]))]), True
-    last = int(recognised[-1])
-    return (last, False) if last < len(along) - 2 else None
-
-
-def _coarse_path(
-    pictures: NDArray[np.float32], noise: float, rows: NDArray[np.float32]
-) -> tuple[Floats, int, NDArray[np.float32]]:
-    """Centre of the body by frame, to a few pixels; half its length along the axis; and the background of the strip.
-    The background is the median over frames spread evenly over the changes, so that a body that rests for long does not
-    become part of it.
+def _coarse_path(pictures: NDArray[np.float32], noise: float, rows: NDArray[np.float32]) -> tuple[Floats, int]:
+    """Centre of the body by frame, to a few pixels, and half its length along the axis. The background is the median
+    over frames spread evenly over the changes, so that a body that rests for long does not become part of it.
     """
     n = len(pictures)
     change = np.zeros(n)
@@ -176,7 +130,7 @@ def _coarse_path(
     box = np.ones(2 * half + 1)
     score = np.stack([np.convolve(row, box, mode="same") for row in foreground])
     # The path that collects most score without a step back divides minus the slope of the score.
-    return dividing_path(-np.diff(score, axis=1, prepend=0.0)) - 1, half, background
+    return dividing_path(-np.diff(score, axis=1, prepend=0.0)) - 1, half
 
 
 def _patch(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,8 @@ DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of eac
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
 
-class CornersError(ValueError):
-    """A picture in which the target cannot be read: what is wrong and what to do, in one sentence."""
+class CalibrationError(RecordingError):
+    """A calibration that cannot be made; of a picture in which the target cannot be read, in one sentence."""
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
@@ -94,16 +94,16 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
     raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
 
 
-def _not_as_stated(picture: NDArray[Any], found: str) -> CornersError:
+def _not_as_stated(picture: NDArray[Any], found: str) -> CalibrationError:
     """The error of a picture that does not show the board of the settings: what was found, and what it shows."""
     seen = find_board(picture)
     if seen is None:
-        return CornersError(
+        return CalibrationError(
             f"{found}; the board with a white border must be in the picture, in focus, evenly lit, not mirrored and "
             "larger than 5 pixels a marker bit, and `squares` counts squares, not inner corners"
         )
     markers = f" with markers of {seen.dictionary}, {seen.marker_share:.2g} of a square wide" if seen.dictionary else ""
-    return CornersError(
+    return CalibrationError(
         f"{found}, but a {seen.kind} of {seen.squares[0]} × {seen.squares[1]} squares{markers}; correct `calibration`"
     )
 
@@ -145,7 +145,7 @@ def _dictionary(name: str) -> Any:
 
     code = getattr(cv2.aruco, name, None)
     if code is None:
-        raise CornersError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
+        raise CalibrationError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
     return cv2.aruco.getPredefinedDictionary(code)
 
 
@@ -205,12 +205,15 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
 
 
 def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floats]:
-    """Corners and their places on the board, both of shape (n, 2), unless they are too few or on one line."""
+    """Corners and their places on the board to a micrometre, both of shape (n, 2), unless they are too few or on one
+    line.
+    """
     if len(grid_m) >= FEWEST_CORNERS:
-        if min(len(np.unique(grid_m[:, k].round(6))) for k in (0, 1)) > 1:
+        grid_m = 1e-6 * np.rint(1e6 * grid_m)
+        if min(len(np.unique(grid_m[:, k])) for k in (0, 1)) > 1:
             return corners_px, grid_m
         seen = "they lie on one line"
-    raise CornersError(
+    raise CalibrationError(
         f"only {len(grid_m)} corners of the board can be read ({seen}; at least {FEWEST_CORNERS}, not on one line, are "
         "needed); show more of it, larger, in focus, evenly lit and not mirrored"
     )
@@ -401,10 +404,6 @@ def _residuals(values: Floats, corners: Floats, board: Floats) -> Floats:
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
 
 
-class CalibrationError(RecordingError):
-    """A calibration that cannot be made."""
-
-
 @dataclass(frozen=True)
 class AxisScale:
     """The calibration along one growth axis. `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative
@@ -428,7 +427,6 @@ class PlaneCalibration:
     plane: PlaneMap
     reprojection_px: float
     n_corners: int
-    n_pictures: int
     own_rel_sigma: float
     covered_px: tuple[float, float, float, float]
     notes: tuple[str, ...] = ()
@@ -436,48 +434,39 @@ class PlaneCalibration:
     @property
     def m_per_px(self) -> float:
         """Scale across the middle of what the target covers, m/px."""
-        return self.along(*self._middle_line()).m_per_px
+        return self.along(self._middle_line()).m_per_px
 
     @property
     def scale_rel_sigma(self) -> float:
         """Relative standard error of `m_per_px`; NaN where unknown."""
-        return self.along(*self._middle_line()).scale_rel_sigma
+        return self.along(self._middle_line()).scale_rel_sigma
 
-    def along(self, from_px: Sequence[float], to_px: Sequence[float]) -> AxisScale:
-        """Return scale and position along an axis of the picture. Shape (n, 2)."""
-        ends_px = np.array([from_px, to_px], dtype=float)
-        start_m, end_m = self.plane.plane_m(ends_px)
-        length_m = float(np.linalg.norm(end_m - start_m))
-        direction = (end_m - start_m) / length_m
+    def along(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
+        """Return scale and position along an axis: the arc length of a curve in the plane, not of its chord, which
+        `off_px` across it changes.
+        """
+        places_px, along_px = np.array([axis.from_px, axis.to_px]), np.array([0.0, axis.length_px])
+        if axis.bends:
+            # 4.0: length of the chords over which a curve is summed in the plane (derived)
+            along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / 4.0) + 2)
+            places_px = axis.points(along_px)
+        places_m = self.plane.plane_m(places_px)
+        path_m = length_along(places_m)
 
         def position_m(picture_px: Floats) -> Floats:
-            return np.asarray((self.plane.plane_m(picture_px) - start_m) @ direction)
+            if axis.bends:
+                return np.interp(axis.along_and_across(picture_px)[0], along_px, path_m)
+            return np.asarray((self.plane.plane_m(picture_px) - places_m[0]) @ (places_m[1] - places_m[0]) / path_m[1])
 
-        m_per_px = length_m / float(np.linalg.norm(ends_px[1] - ends_px[0]))
-        rel_sigma = math.hypot(self.plane.path_rel_sigma(ends_px), self.own_rel_sigma)
-        return AxisScale(m_per_px, rel_sigma, position_m)
-
-    def along_path(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
-        """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord."""
-        if not axis.bends:
-            return self.along(axis.from_px, axis.to_px)
-        # 4.0: length of the chords over which a curve is summed in the plane (derived)
-        along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / 4.0) + 2)
-        places_px = axis.points(along_px)
-        path_m = length_along(self.plane.plane_m(places_px))
         rel_sigma = math.hypot(self.plane.path_rel_sigma(places_px), self.own_rel_sigma)
         rel_sigma = math.hypot(rel_sigma, off_px * abs(axis.turn_rad) / axis.length_px)
-
-        def position_m(picture_px: Floats) -> Floats:
-            return np.interp(axis.along_and_across(picture_px)[0], along_px, path_m)
-
         return AxisScale(float(path_m[-1]) / axis.length_px, rel_sigma, position_m)
 
-    def _middle_line(self) -> tuple[tuple[float, float], tuple[float, float]]:
+    def _middle_line(self) -> Axis:
         left, top, right, bottom = self.covered_px
         if self.plane.width_px >= self.plane.height_px:
-            return (left, (top + bottom) / 2), (right, (top + bottom) / 2)
-        return ((left + right) / 2, top), ((left + right) / 2, bottom)
+            return Axis((left, (top + bottom) / 2), (right, (top + bottom) / 2))
+        return Axis(((left + right) / 2, top), ((left + right) / 2, bottom))
 
 
 def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int) -> PlaneCalibration:
@@ -486,7 +475,7 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
     if isinstance(settings, MmPerPx):
         plane = PlaneMap.from_scale(settings.mm_per_px / 1000, width_px, height_px)
         note = "the scale is the one given as mm_per_px; nothing is known of its error, nor of distortion and tilt"
-        return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, whole, (note,))
+        return PlaneCalibration("mm_per_px", plane, math.nan, 0, math.nan, whole, (note,))
     if isinstance(settings, TwoPoints):  # each point errs by CLICK_SIGMA_PX along the line
         distance_px = math.dist(settings.from_px, settings.to_px)
         plane = PlaneMap.from_scale(settings.length_mm / 1000 / distance_px, width_px, height_px)
@@ -495,52 +484,42 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
             "and on nothing else"
         )
         rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
-        return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, whole, (note,))
-    # Up to ten pictures, spread over the first 300 frames of a recording (chosen), while nothing hides the target yet
-    most_pictures, searched_frames = 10, 300
+        return PlaneCalibration("two_points", plane, math.nan, 2, rel_sigma, whole, (note,))
     try:
         recording = inspect_recording(folder / settings.image)
-        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
-        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
-        pictures = list(itertools.islice(frames, most_pictures))
     except RecordingError as error:
         raise CalibrationError(error.what, error.remedy) from error
-    if not pictures:
-        raise CalibrationError(f"{settings.image} holds no picture that can be read", "copy it from the camera again")
-    sizes_seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
-    if sizes_seen != {(width_px, height_px)}:
-        sizes = " and ".join(f"{width} × {height}" for width, height in sorted(sizes_seen))
+    if (recording.width, recording.height) != (width_px, height_px):
         raise CalibrationError(
-            f"{settings.image} is {sizes} pixels but the recordings are {width_px} × {height_px}",
+            f"{settings.image} is {recording.width} × {recording.height} pixels but the recordings are {width_px} × "
+            f"{height_px}",
             "film the target with the camera's settings of the trials, without cropping or resizing",
         )
-    return calibrate_pictures(pictures, settings)
+    # Up to ten pictures, spread over the first 300 frames of a recording (chosen), while nothing hides the target yet
+    most_pictures, searched_frames = 10, 300
+    every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
+    return calibrate_pictures(
+        itertools.islice(iterate_frames(recording), 0, every * (most_pictures - 1) + 1, every), settings
+    )
 
 
-def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
-    """Calibrate from pictures of a target, grey levels of shape (height, width) each. The corners of a stationary
-    target are averaged. Of a target that is moved the first readable picture shows the plane of growth, and is used
-    alone. Shapes: pictures (height, width).
+def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
+    """Calibrate from the first picture in which a target can be read: more add less than the error that all corners
+    share. Shapes: pictures (height, width), grey levels.
     """
-    views, complaints = [], []
-    read = charuco_corners if isinstance(board, Charuco) else checkerboard_corners
+    complaint = "it holds no picture that can be read"
     for picture in pictures:
         try:
-            views.append(read(picture, board))  # type: ignore[arg-type]
-        except CornersError as error:
-            complaints.append(str(error))
-    if not views:
-        raise CalibrationError(complaints[0], name=board.image)
-    height, width = pictures[0].shape
-    notes = [f"{board.image}: the target is read in {len(views)} of {len(pictures)} pictures"] if complaints else []
-    moved_px = _target_motion_px(views)
-    # 0.5: motion of the corners over a clip above which the target was moved (chosen)
-    if not moved_px < 0.5:
-        notes.append(
-            f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
-        )
-        views = views[:1]
-    corners_px, board_m = _median_corners(views)
+            if isinstance(board, Charuco):
+                corners_px, board_m = charuco_corners(picture, board)
+            else:
+                corners_px, board_m = checkerboard_corners(picture, board)
+            break
+        except CalibrationError as error:
+            complaint = error.message
+    else:
+        raise CalibrationError(complaint, name=board.image)
+    height, width = picture.shape
     plane, reprojection_px = fit_plane(corners_px, board_m, width, height)
     # 2.0: distance of the corners from the model above which the board is another one (chosen)
     if reprojection_px > 2.0:
@@ -550,6 +529,7 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
             "check `squares`, and that the board is flat",
             board.image,
         )
+    notes = []
     # Beyond a target that spans less than half of the picture, scale and distortion are extrapolated.
     share = float(np.ptp(corners_px[:, 0 if width >= height else 1])) / max(width, height)
     if share < 0.5:
@@ -559,38 +539,7 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     # 0.05: bias that the corners at one end of a target may share, px: the error of one (measured)
     bias_rel = 0.05 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
-    return PlaneCalibration(
-        board.kind, plane, reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
-    )
-
-
-def _corners_by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:
-    """Corners of a view by their place on the target, in micrometres."""
-    return {(round(x * 1e6), round(y * 1e6)): corner for corner, (x, y) in zip(view[0], view[1], strict=True)}
-
-
-def _target_motion_px(views: Sequence[tuple[Floats, Floats]]) -> float:
-    """Motion of the target: the median, over corners, of the distance from the first view; the largest of all views."""
-    first = _corners_by_place(views[0])
-    largest = 0.0
-    for view in views[1:]:
-        places = _corners_by_place(view)
-        shared = [place for place in first if place in places]
-        if not shared:
-            return math.inf
-        distances = [float(np.linalg.norm(first[place] - places[place])) for place in shared]
-        largest = max(largest, float(np.median(distances)))
-    return largest
-
-
-def _median_corners(views: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Corners of a stationary target: the median over the views that show each."""
-    gathered: dict[tuple[float, float], list[Floats]] = {}
-    for view in views:
-        for place, corner in _corners_by_place(view).items():
-            gathered.setdefault(place, []).append(corner)
-    corners = np.array([np.median(seen, axis=0) for seen in gathered.values()])
-    return corners, np.array(list(gathered)) * 1e-6
+    return PlaneCalibration(board.kind, plane, reprojection_px, len(corners_px), bias_rel, covered, tuple(notes))
 
 
 # ------------------------------------------------------------------------------

@@ -648,7 +648,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
         slow_px = np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0))
     slow = np.hypot(slow, slow_px)
     return Positions(
-        strip=strip, edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
+        strip=strip, edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden),
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
         bands_sigma_px=bands,
     )  # fmt: skip

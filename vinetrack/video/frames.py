@@ -22,12 +22,9 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
-from vinetrack.core.threads import njit
 
 if TYPE_CHECKING:
     import av
-
-    from vinetrack.video.strip import Strip
 
 
 # ------------------------------------------------------------------------------
@@ -56,50 +53,71 @@ class Decoded:
     key: list[bool] = field(default_factory=list)
     between: list[bool] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
-    decoder: str = ""
 
 
 def decode_container(recording: Recording, count: int, between: tuple[int, int] | None = None) -> Decoded:
-    """Decode every frame, or those from a tick to another; a packet that cannot be decoded costs only its own frame.
-    Memory is taken for `count` frames, or for more where they come.
+    """Decode every frame, or those from a tick to another. Memory is taken for `count` frames, or for more where they
+    come.
+    """
+    decoded = Decoded()
+    first, last = between or (None, math.inf)
+
+    def pictures() -> Generator[NDArray[Any]]:
+        for frame, is_corrupt in film_frames(recording.path, said, begin=first):
+            if first is not None and (frame.pts is None or frame.pts < first):
+                continue
+            if frame.pts is not None and frame.pts > last:
+                return
+            if (frame.height, frame.width) != (recording.height, recording.width):
+                said.append((0, "", "the size of the picture changes"))
+                return
+            picture = luma_plane(frame)
+            decoded.ticks.append(math.nan if frame.pts is None else frame.pts)
+            decoded.corrupt.append(is_corrupt)
+            decoded.key.append(bool(frame.key_frame))
+            decoded.between.append(frame.pict_type == 3)  # 3: code of a B frame (defined)
+            yield picture
+
+    with quiet_log() as said, contextlib.closing(pictures()) as taken:
+        decoded.pictures = filled(recording, taken, count)
+    decoded.messages = [message.strip() for *_, message in said]
+    return decoded
+
+
+def film_frames(
+    path: Path, said: list[Said], begin: int | None = None, chosen: Container[int] | None = None
+) -> Iterator[tuple[av.VideoFrame, bool]]:
+    """Decode a film, from the key frame before a tick on, or the packets of chosen ticks alone, and say whether each
+    frame is corrupt: as the decoder marks it, or as it says of the packet in `said`, to which it adds what it says. A
+    packet that cannot be decoded costs only its own frame.
     """
     import av
 
-    decoded = Decoded()
-
-    def pictures() -> Generator[NDArray[Any]]:
-        try:
-            with open_film(recording.path) as container:
-                stream = container.streams.video[0]
-                stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS
-                decoded.decoder = stream.codec_context.name
-                if between is not None:
-                    container.seek(max(between[0], 0), stream=stream)
-                for frame in _frames_of(container.demux(stream), messages):
-                    if between is not None:
-                        if frame.pts is None or frame.pts < between[0]:
-                            continue
-                        if frame.pts > between[1]:
-                            break
-                    if (frame.height, frame.width) != (recording.height, recording.width):
-                        messages.append("the size of the picture changes")
-                        break
-                    picture = luma_plane(frame)
-                    decoded.ticks.append(math.nan if frame.pts is None else frame.pts)
-                    decoded.corrupt.append(bool(frame.is_corrupt))
-                    decoded.key.append(bool(frame.key_frame))
-                    decoded.between.append(frame.pict_type == 3)  # 3: code of a B frame (defined)
-                    yield picture
-        except av.error.FFmpegError as error:
-            messages.append(str(error.strerror or error))
-
-    with quiet_log() as messages, contextlib.closing(pictures()) as taken:
-        decoded.pictures = filled(recording, taken, count)
-    decoded.messages = list(messages)
-    if decoded.messages and decoded.ticks and decoded.decoder in NON_MARKING_DECODERS:
-        marked = _ticks_of_faulty_packets(recording.path)
-        decoded.corrupt = [ticks in marked for ticks in decoded.ticks]
-    return decoded
+    try:
+        with open_film(path) as container:
+            stream = container.streams.video[0]
+            marks = stream.codec_context.name not in NON_MARKING_DECODERS
+            faulty: set[int | None] = set()
+            # With one thread each message belongs to the packet that is decoded.
+            stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS if marks else 1
+            if begin is not None:
+                container.seek(max(begin, 0), stream=stream)
+            for packet in container.demux(stream):
+                if chosen is not None and packet.size and packet.pts not in chosen:
+                    continue
+                heard, frames = len(said), []
+                try:
+                    frames = packet.decode()
+                except av.error.EOFError:
+                    return
+                except av.error.FFmpegError as error:
+                    said.append((0, "", str(error.strerror or error)))
+                if len(said) > heard and not marks:
+                    faulty.add(packet.pts)
+                for frame in frames:
+                    yield frame, bool(frame.is_corrupt) or frame.pts in faulty
+    except av.error.FFmpegError as error:
+        said.append((0, "", str(error.strerror or error)))
 
 
 def damaged_frames(decoded: Decoded, slot: Indices) -> Bools:
@@ -146,16 +164,6 @@ def packet_index(path: Path) -> PacketIndex | None:
     return PacketIndex(times, np.array(key, dtype=bool)[order])
 
 
-def decode_packets(path: Path, chosen: Container[int] | None) -> Iterator[av.VideoFrame]:
-    """Decode selected packets of a film."""
-    with quiet_log() as messages, open_film(path) as container:
-        stream = container.streams.video[0]
-        stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS
-        packets = container.demux(stream)
-        wanted = (packet for packet in packets if chosen is None or not packet.size or packet.pts in chosen)
-        yield from _frames_of(wanted, messages)
-
-
 @contextlib.contextmanager
 def open_film(path: Path) -> Iterator[av.container.InputContainer]:
     """Open a film for decoding; its decoder is flushed before it is closed. Freeing a decoder waits for its threads
@@ -173,38 +181,6 @@ def open_film(path: Path) -> Iterator[av.container.InputContainer]:
                     stream.codec_context.flush_buffers()
 
 
-def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterator[av.VideoFrame]:
-    """Yield the frames of packets; packets that cannot be decoded are skipped and their errors recorded."""
-    import av
-
-    for packet in packets:
-        try:
-            yield from packet.decode()
-        except av.error.EOFError:
-            return
-        except av.error.FFmpegError as error:
-            messages.append(str(error.strerror or error))
-
-
-def _ticks_of_faulty_packets(path: Path) -> set[int]:
-    """Return the ticks of the packets about which the decoder logs an error. The film is decoded once more, with one
-    thread, so that each message can be assigned to its packet.
-    """
-    import av
-    import av.logging
-
-    marked: set[int] = set()
-    with quiet_log(), open_film(path) as container, contextlib.suppress(av.error.FFmpegError):
-        stream = container.streams.video[0]
-        stream.codec_context.thread_count = 1
-        for packet in container.demux(stream):
-            with av.logging.Capture(True) as messages, contextlib.suppress(av.error.FFmpegError):
-                packet.decode()
-            if messages and packet.pts is not None:
-                marked.add(packet.pts)
-    return marked
-
-
 def memory_for_pictures() -> float:
     """Bytes that decoded pictures may take; infinity if the machine's memory is unknown."""
     try:
@@ -214,58 +190,31 @@ def memory_for_pictures() -> float:
         return math.inf
 
 
+Said = tuple[int, str, str]  # Level, source and text of a message of the decoder
+
 _one_log = threading.RLock()  # The decoder has one log for the whole process
 
 
 @contextlib.contextmanager
-def quiet_log() -> Iterator[list[str]]:
+def quiet_log() -> Iterator[list[Said]]:
     """Collect the decoder's messages instead of printing or losing them; the log level is restored afterwards. Films
     that several threads decode wait for each other, or one would count as damaged for the faults of another.
     """
     import av.logging
 
-    messages: list[str] = []
     with _one_log:
         level = av.logging.get_level()
         av.logging.set_level(av.logging.ERROR)
         av.logging.set_skip_repeated(False)  # Else what two films say alike is heard once, in either
         try:
-            with av.logging.Capture(False) as logs:
-                yield messages
+            with av.logging.Capture(False) as said:
+                yield said
         finally:
-            messages.extend(message.strip() for _, _, message in logs)
             av.logging.set_level(level)
 
 
 # ------------------------------------------------------------------------------
-# Detect pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies.
-
-
-def torn_frames(luma: NDArray[Any]) -> Bools:
-    """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data. A front
-    that passes leaves a block between its values before and after; a tear lies outside both. Shapes: luma (n_frames,
-    height, width) → (n_frames,).
-    """
-    torn_block_px, torn_run = 16, 12  # Side of the blocks that are compared (derived)
-    n, height, width = luma.shape
-    rows, columns = height // torn_block_px, width // torn_block_px
-    if n < 6 or rows == 0 or columns < torn_run:
-        return np.zeros(n, dtype=bool)
-    cropped = luma[:, : rows * torn_block_px, : columns * torn_block_px]
-    grid = (rows, torn_block_px, columns, torn_block_px)
-    block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cropped])
-    block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
-    excess = np.zeros_like(block)
-    place = np.arange(n)
-    for gap in (1, 2):  # two torn frames in a row are compared with those around both
-        before = np.where(place >= gap, place - gap, place + 2 * gap)
-        after = np.where(place + gap < n, place + gap, place - 2 * gap)
-        low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
-        excess = np.maximum(excess, np.maximum(block - high, low - block))
-    unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
-    # 4.0, 4.0: distance of a block outside them (chosen)
-    limit = 4.0 * unit + 4.0 * np.quantile(excess, 0.75, axis=0)
-    return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= torn_run)
+# Detect pictures that are not what the camera saw at their time: odd ones at the beginning.
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
@@ -288,48 +237,6 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     for i in range(3):
         odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
     return odd
-
-
-def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
-    """Frames in which the surroundings of the edge repeat those of the frame before. The change of the picture is
-    compared with that where the edge moves, and the edge must stand still between frames that show it moving on.
-    Shapes: edge_px (n_frames,) → (n_frames,).
-    """
-    around_px = 40  # Columns on either side of the edge that are compared (chosen)
-    clear_step_px = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
-    n, _, columns = strip.values.shape
-    seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
-    low = np.clip(seen_px - around_px, 0, columns - 1).astype(int)
-    high = np.maximum(np.clip(seen_px + around_px, 1, columns).astype(int), low + 1)
-    change = np.where(np.isfinite(edge_px), _changes_between(strip.values, low, high) * strip.scale, np.inf)
-    moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > clear_step_px / 2
-    median_change = float(np.median(change[moving])) if moving.any() else np.inf
-    repeated = np.zeros(n, dtype=bool)
-    for i in range(2, n - 1):
-        mean_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        # 0.1, 0.15: A copy moves less than this part of a step, and its picture changes by less than this
-        # part of the median (chosen)
-        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * mean_step
-        repeated[i] = mean_step > clear_step_px and stands and change[i] < 0.15 * median_change
-    return repeated
-
-
-@njit(nogil=True)
-def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
-    The first has none before it: infinity.
-    """
-    n, rows, _ = values.shape
-    out = np.full(n, np.inf)
-    for t in range(1, n):
-        total = np.int64(0)
-        for u in range(0, rows, 2):
-            before, after = values[t - 1, u, low[t] : high[t]], values[t, u, low[t] : high[t]]
-            for s in range(len(before)):
-                total += abs(np.int32(after[s]) - np.int32(before[s]))
-        out[t] = total / ((rows + 1) // 2 * (high[t] - low[t]))
-    return out
 
 
 DECODER_THREADS = 2  # Decoder threads per recording (chosen)
@@ -403,14 +310,14 @@ def inspect_recording(path: Path | str) -> Recording:
         raise RecordingError("there is no such file or folder", name=path.name) from None
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", name=path.name) from None
-    from vinetrack.video.images import inspect_camera_file, inspect_images
+    from vinetrack.video.images import inspect_cine, inspect_images, inspect_mraw
 
     if path.is_dir() or path.suffix.lower() in IMAGES:
         return inspect_images(path)
     if size == 0:
         raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     if path.suffix.lower() in CAMERA_FILES:
-        return inspect_camera_file(path)
+        return inspect_cine(path) if path.suffix.lower() == ".cine" else inspect_mraw(path)
     return _inspect_container(path)
 
 
@@ -421,11 +328,9 @@ def read_frames(
     recording = path if isinstance(path, Recording) else inspect_recording(path)
     if recording.kind == "container":
         return _read_film(recording, part, index)
-    if recording.raw is not None:
-        return _read_raw(recording, recording.raw, part)
     from vinetrack.video.images import read_images
 
-    return read_images(recording)
+    return read_images(recording, part)
 
 
 def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -> NDArray[Any]:
@@ -435,11 +340,16 @@ def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
     luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
+    too_large = RecordingError(
+        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
+        "cut it to the growth, and to the part of the picture that shows it",
+        recording.path.name,
+    )
     if count > most:
-        raise _too_large(recording)
+        raise too_large
     for n, picture in enumerate(pictures, 1):
         if n > most:
-            raise _too_large(recording)
+            raise too_large
         if n == 1:  # untouched memory takes no space
             luma = np.empty((count, *picture.shape), picture.dtype)
         if n > len(luma):
@@ -448,33 +358,15 @@ def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -
     return luma[:n]
 
 
-def _too_large(recording: Recording) -> RecordingError:
-    """Make the error for a recording that does not fit in memory."""
-    return RecordingError(
-        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
-        "cut it to the growth, and to the part of the picture that shows it",
-        recording.path.name,
-    )
-
-
 def iterate_frames(recording: Recording) -> Iterator[NDArray[Any]]:
-    """Yield one frame after another, as copies; stop where decoding fails."""
-    if recording.raw is not None:
-        yield from recording.raw.pictures()
+    """Yield one frame after another, as copies."""
+    if recording.kind == "container":
+        for frame, _ in film_frames(recording.path, []):
+            yield luma_plane(frame)[: recording.height, : recording.width].copy()
         return
-    if recording.kind != "container":
-        from vinetrack.video.images import pictures_of
+    from vinetrack.video.images import pictures_of
 
-        yield from (picture for picture, _ in pictures_of(recording))
-        return
-    import av
-
-    with open_film(recording.path) as container:
-        try:
-            for frame in container.decode(video=0):
-                yield luma_plane(frame)[: recording.height, : recording.width].copy()
-        except av.error.FFmpegError:
-            return
+    yield from (picture for picture, _ in pictures_of(recording))
 
 
 def luma_plane(frame: av.VideoFrame) -> NDArray[Any]:
@@ -496,7 +388,7 @@ def _inspect_container(path: Path) -> Recording:
     import av
 
     try:
-        with quiet_log() as messages, open_film(path) as container:
+        with quiet_log() as said, open_film(path) as container:
             # Formats under which FFmpeg renders any text as a picture of its letters
             if container.format.name in {"tty", "bin", "xbin", "adf", "idf", "svg_pipe"}:
                 raise RecordingError("a text, not a recording", "name a film, or a folder of pictures", path.name)
@@ -522,7 +414,7 @@ def _inspect_container(path: Path) -> Recording:
             why = "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
         with path.open("rb") as begin:
             is_film = begin.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
-        if is_film and "moov atom not found" in " ".join([*messages, str(error)]):
+        if is_film and "moov atom not found" in " ".join([*(text for *_, text in said), str(error)]):
             why = "cut short: the index that is written last is missing", "copy the file again, or repair it"
         raise RecordingError(*why, path.name) from error
 
@@ -547,11 +439,9 @@ def _read_film(recording: Recording, part: tuple[int, int] | None, index: Packet
             "from the camera again"
         )
     frames = frames_at(recording, decoded.pictures, ticks, number, lost=max(declared - len(ticks), 0))
-    if decoded.decoder in NON_MARKING_DECODERS:
-        decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()
     damaged = damaged_frames(decoded, frames.slot)
     if decoded.messages or damaged.any():
-        first_message = f"; the first: {decoded.messages[0].strip()}" if decoded.messages else ""
+        first_message = f"; the first: {decoded.messages[0]}" if decoded.messages else ""
         notes.append(
             f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or coded from corrupt ones"
             f" ({len(decoded.messages)} messages of the decoder{first_message})"
@@ -688,21 +578,3 @@ def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
     return np.rint(cv2.sepFilter2D(mosaic.astype(np.float32), -1, kernel, kernel)).astype(mosaic.dtype)
-
-
-def _read_raw(recording: Recording, raw: RawFrames, part: tuple[int, int] | None) -> Frames:
-    """Read the frames of a camera's own file, or a part of them."""
-    name, notes, count = recording.path.name, list(recording.notes), len(raw.offsets)
-    first, last = part or (0, count - 1)
-    luma = filled(recording, replace(raw, offsets=raw.offsets[first : last + 1]).pictures(), last - first + 1)
-    n, expected = len(luma), last - first + 1 if part else recording.declared_frames or 0
-    if n == 0:
-        raise RecordingError("not one frame is in the file", "copy it from the camera again", name)
-    if n < expected:
-        notes.append(
-            f"{name}: the file holds {n} frames but declares {expected}: cut short; copy it from the camera again"
-        )
-    there = count if part else n
-    times = np.arange(there) if raw.times_s is None else raw.times_s[:there]
-    frames = frames_at(recording, luma, times, first + np.arange(n))
-    return replace(frames, notes=(*notes, *frames.notes))

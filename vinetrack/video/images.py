@@ -75,12 +75,7 @@ MARK_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 896, 1568  # Offsets in the settings
 EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
 
-def inspect_camera_file(path: Path) -> Recording:
-    """Read the header of a file of a high-speed camera, by its suffix."""
-    return _inspect_cine(path) if path.suffix.lower() == ".cine" else _inspect_mraw(path)
-
-
-def _inspect_cine(path: Path) -> Recording:
+def inspect_cine(path: Path) -> Recording:
     """Read the header of a Phantom `.cine`."""
     name = path.name
     try:
@@ -197,7 +192,7 @@ def _cine_clock(
     return rate or None, exposure_s or None, times_s, tuple(notes)
 
 
-def _inspect_mraw(path: Path) -> Recording:
+def inspect_mraw(path: Path) -> Recording:
     """Read the side file of a Photron `.mraw`."""
     data = next(iter(_siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
@@ -346,35 +341,42 @@ def inspect_images(path: Path) -> Recording:
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
 
-def read_images(recording: Recording) -> Frames:
-    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
-    name, count, whole = recording.path.name, recording.declared_frames or 0, []
+def read_images(recording: Recording, part: tuple[int, int] | None = None) -> Frames:
+    """Read every picture, or a part of a camera's own file; one that is truncated or cannot be read is partial or
+    black, and marked damaged.
+    """
+    name, raw, whole, notes = recording.path.name, recording.raw, list[bool](), list(recording.notes)
+    count = len(raw.offsets) if raw else recording.declared_frames or 0
+    first, last = part or (0, count - 1)
+    wanted = replace(recording, raw=replace(raw, offsets=raw.offsets[first : last + 1])) if raw else recording
 
     def pictures() -> Iterator[NDArray[Any]]:
-        for picture, is_whole in pictures_of(recording):
+        for picture, is_whole in pictures_of(wanted):
             whole.append(is_whole)
             yield picture
 
-    luma = filled(recording, pictures(), count)
-    damaged, notes = ~np.array(whole, dtype=bool), list(recording.notes)
-    if len(luma) < count:
-        notes.append(f"{name}: {len(luma)} pages read where the stack declares {count}: cut short")
+    luma = filled(recording, pictures(), last - first + 1)
+    damaged, expected = ~np.array(whole, dtype=bool), last - first + 1 if part else recording.declared_frames or 0
     if damaged.all():
-        raise RecordingError("not one picture can be read", "the files are damaged", name)
+        raise RecordingError("not one picture can be read", "copy it from the camera again", name)
+    if len(luma) < expected:
+        notes.append(f"{name}: {len(luma)} pictures are there where {expected} are declared: cut short")
     if damaged.any():
-        first = recording.files[int(np.argmax(damaged))].name
+        victim = recording.files[int(np.argmax(damaged))].name
         notes.append(
-            f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {first}"
+            f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {victim}"
         )
-    number = np.arange(len(luma))  # the files may be numbered in any step
-    frames = frames_at(recording, luma, np.array(recording.numbers) if recording.numbers else number, number)
+    times = raw.times_s if raw else np.array(recording.numbers) if recording.numbers else None  # numbers in any step
+    times = np.arange(count) if times is None else times
+    frames = frames_at(recording, luma, times[: count if part else len(luma)], first + np.arange(len(luma)))
     return replace(frames, damaged=damaged, notes=(*notes, *frames.notes))
 
 
 def pictures_of(recording: Recording) -> Iterator[tuple[NDArray[Any], bool]]:
     """Each picture, and whether it is whole. One that cannot be read is black; a stack ends before it."""
-    if recording.kind == "stack":
-        yield from ((page, True) for page in _stack_pages(recording))
+    if recording.raw is not None or recording.kind == "stack":
+        pages = recording.raw.pictures() if recording.raw is not None else _stack_pages(recording)
+        yield from ((page, True) for page in pages)
         return
     shape, dtype = (recording.height, recording.width), np.uint8 if recording.bit_depth <= 8 else np.uint16
     # Decoders silently fill a missing part with grey: a JPEG or PNG must have its end marker.

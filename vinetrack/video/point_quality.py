@@ -1,4 +1,4 @@
-"""Quality of each point of a track: release, end, lost and doubtful points, repeated frames.
+"""Quality of each point of a track: release, end, lost and doubtful points.
 
 Works on positions alone, in pixels by frame, from any tracker.
 """
@@ -94,9 +94,7 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
     return last_at_rest + 1 if last_at_rest >= 2 else 0
 
 
-def assess_points(
-    edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, repeated: Bools, end_px: float
-) -> PointQuality:
+def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, end_px: float) -> PointQuality:
     """Flag every frame. Arrays have shape (n_frames,)."""
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
@@ -107,17 +105,12 @@ def assess_points(
     notes = []
     if first_outside < n:
         notes.append(f"the leading edge leaves the picture at frame {number[first_outside]}; later frames are not used")
-    repeats = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
-    if repeats.any():
-        count, first_repeat = int(repeats.sum()), number[repeats][0]
-        notes.append(f"{count} frames repeat the one before them and are dropped, first frame {first_repeat}")
     without_edge = no_edge & (np.arange(n) < first_outside)
     flags = [
         join_flags(
             "before_release" if i < first else "",
             "after_end" if i > last >= 0 or i >= first_outside else "",
             "lost" if without_edge[i] else "",
-            "duplicate" if repeats[i] else "",
             "doubtful" if unsure[i] and not no_edge[i] else "",
         )
         for i in range(n)
@@ -145,14 +138,13 @@ SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again
 @dataclass(frozen=True)
 class Ending:
     """How an edge ends: its way from standstill to standstill, and until the last frame where it still moves there, px
-    (NaN otherwise); `remarks` on where it stopped, and the `place` of all this among the notes.
+    (NaN otherwise); and a `remark` on where it stopped.
     """
 
     grown_px: float = math.nan
     truncated_px: float = math.nan
-    remarks: tuple[str, ...] = ()
+    remark: str = ""
     name: str = ""
-    place: int = 0
 
     def notes(self, length_px: float) -> list[str]:
         """What a track is told about its end; nothing where the whole vine has grown."""
@@ -161,13 +153,12 @@ class Ending:
             return []
         share = f", after {self.truncated_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
         moves = f"{self.name}: the recording ends while the leading edge moves{share}"
-        return [*self.remarks, *([moves] if np.isfinite(self.truncated_px) else [])]
+        return [note for note in (self.remark, moves if np.isfinite(self.truncated_px) else "") if note]
 
 
 def ending_of(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool,
-    place: int,
-) -> Ending:  # fmt: skip
+    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool
+) -> Ending:
     """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: luma (n_frames, height, width);
     edge_px, number (n_frames,).
     """
@@ -195,7 +186,7 @@ def ending_of(
             remark = f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"
         else:
             remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
-    return Ending(grown_px, truncated_px, (remark,) if remark else (), name, place)
+    return Ending(grown_px, truncated_px, remark, name)
 
 
 def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:

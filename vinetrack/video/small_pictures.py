@@ -20,9 +20,10 @@ from vinetrack.video.frames import (
     Frames,
     PacketIndex,
     Recording,
-    decode_packets,
+    film_frames,
     luma_plane,
     packet_index,
+    quiet_log,
     read_frames,
 )
 from vinetrack.video.kymograph import largest_steps
@@ -269,10 +270,11 @@ def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDAr
     candidates = keys if keys_only else np.arange(count)
     chosen = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
     sampled = {}
-    for frame in decode_packets(recording.path, set(chosen) if keys_only else None):
-        number = None if frame.pts is None else chosen.get(frame.pts)
-        if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-            sampled[number] = _shrunk(luma_plane(frame), recording)
+    with quiet_log() as said:
+        for frame, _ in film_frames(recording.path, said, chosen=chosen if keys_only else None):
+            number = None if frame.pts is None else chosen.get(frame.pts)
+            if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
+                sampled[number] = _shrunk(luma_plane(frame), recording)
     numbers = sorted(sampled)
     return [sampled[number] for number in numbers], np.array(numbers, dtype=int)
 

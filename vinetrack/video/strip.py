@@ -51,21 +51,19 @@ class Positions:
     the edge, or the body, is at mid-exposure, NaN where it is not seen, `sigma_px` its standard error from the fit
     alone; `extra_sigma_px` is what is added to that in all, `bands_sigma_px` the part of it that differs from frame to
     frame, `slow_px` what neighbouring frames share. `reach_px` is how far from the end of the strip the last place is
-    that can be seen; `end` the last frame of a body's motion, and whether it turns back there; `width_px` that of a
-    tube, with its standard error.
+    that can be seen; `end` the frame in which a body turns back; `width_px` that of a tube, with its standard error.
     """
 
     strip: Strip
     edge_px: Floats
     sigma_px: Floats
     unsure: Bools
-    blur_px: float
     reach_px: float
     slow_px: Floats | float
     exposure_frames: float = math.nan
     extra_sigma_px: Floats | float = 0.0
     bands_sigma_px: Floats | float = 0.0
-    end: tuple[int, bool] | None = None
+    end: int | None = None
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
     is_edge: bool = True

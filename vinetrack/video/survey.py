@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, askew_trials, axis_through, slope_deg
+from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.curved_axis import axis_entry, curve_problem, find_growth_axis
 from vinetrack.video.edge import tube_strip
@@ -91,7 +91,7 @@ def measure_recording(
     rel_sigma, position_m = math.nan, None
     if calibration is not None:
         bent = tracking.axis.bends and math.isfinite(tracking.tube_width_sigma_px)
-        along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
+        along = calibration.along(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = in_metres(tracking, trial, m_per_px, position_m)
     # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
@@ -260,47 +260,6 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
     )  # fmt: skip
 
 
-def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
-    """Note where growth in the picture runs in another direction than in the sheet; no fault, since cameras are turned.
-    That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
-    straight down and that runs level.
-    """
-    steep_deg = 60.0  # Angle between growth and the picture's rows above which growth runs up or down (chosen)
-    upright, level = [], []
-    for fact, trial in zip(facts, trials, strict=True):
-        if fact.axis is None or fact.axis.bends or trial.travel_ratio == 1:
-            continue
-        right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
-        slope_deg = math.degrees(math.atan2(down, right))
-        from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
-        upright += [trial.name] if slope_deg > steep_deg and from_level_deg < 90 - steep_deg else []
-        level += [trial.name] if slope_deg < 90 - steep_deg and trial.name in blank else []
-    findings = (
-        (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
-        (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
-    )
-    return [f"growth runs {way} in the picture ({_named(who)}) and {remark}" for who, way, remark in findings if who]
-
-
-def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Name recordings whose axis was found askew to that of most others that grow at the same angle. Something else
-    that moves, such as a door as long as the growth, was then taken for the tube.
-    """
-    axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
-    slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
-    return [
-        f"a growth axis other than that of {n_agreeing} recordings was found ({_named(names)}): where one camera "
-        "filmed them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those "
-        "(column `axis`)"
-        for names, n_agreeing in askew_trials(slopes_deg, trials)
-    ]
-
-
-def _named(names: list[str]) -> str:
-    """One name, or how many recordings and the first of them."""
-    return names[0] if len(names) == 1 else f"{len(names)} recordings, {names[0]} first"
-
-
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
     """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
     `down` is the growth angle from straight down as the sheet states it: no picture shows it.
@@ -435,19 +394,16 @@ def _frames_present(recording: Recording) -> int | None:
     import av
 
     size = recording.path.stat().st_size
-    try:
-        with av.open(str(recording.path)) as container:
-            stream = container.streams.video[0]
-            entries = stream.index_entries
-            if stream.frames and len(entries) >= stream.frames:
-                return sum(entry.pos + entry.size <= size for entry in entries)
-            # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
-            if size > 64_000_000:
-                return None
+    # Damage that the walk meets decoding will report.
+    with contextlib.suppress(av.error.FFmpegError, AttributeError), av.open(str(recording.path)) as container:
+        stream = container.streams.video[0]
+        entries = stream.index_entries
+        if stream.frames and len(entries) >= stream.frames:
+            return sum(entry.pos + entry.size <= size for entry in entries)
+        # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
+        if size <= 64_000_000:
             return sum(1 for packet in container.demux(stream) if packet.size)
-    except (av.error.FFmpegError, AttributeError):
-        # The walk met damage, which decoding will report.
-        return None
+    return None
 
 
 def _scale_problems(

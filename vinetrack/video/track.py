@@ -17,7 +17,7 @@ from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import curve_problem, find_growth_axis
 from vinetrack.video.edge import EdgeTracker
-from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
@@ -65,7 +65,7 @@ class ArrivalTracker:
         # 0.8, 1.0: random and slow error of an arrival (measured)
         return Positions(
             strip=strip, edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool),
-            blur_px=1.0, reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
+            reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
         )  # fmt: skip
 
 
@@ -132,29 +132,23 @@ STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the st
 
 @dataclass(frozen=True)
 class Tracking:
-    """A track and what a figure of it needs. `kymograph`, shape (n_frames, n_along), is the strip's brightness averaged
-    across, in grey levels; column j lies `j` px from `axis.from_px`, and `edge_px` of the track counts from the same
-    point.
+    """A track and what a figure of it needs. `kymograph`, shape (n_rows, n_along), is the strip's brightness averaged
+    across, in grey levels; `strip_rows`, shape (n_rows,), are the frames of its rows. Column j lies `j` px from
+    `axis.from_px`, and `edge_px` of the track counts from the same point.
     """
 
     track: Track
     axis: Axis
     kymograph: NDArray[np.float32]
+    strip_rows: Indices
     pictures: tuple[tuple[int, NDArray[Any]], ...]
-    blur_px: float
     exposure_frames: float
     shake_px: Floats
     tube_width_px: float = math.nan
     tube_width_sigma_px: float = math.nan
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
-    strip_frames: Indices | None = None
     ending: Ending = field(default_factory=Ending)
-
-    @property
-    def strip_rows(self) -> Indices:
-        """Frame of each row of `kymograph`, shape (n_rows,)."""
-        return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
 
 
 def track_recording(trial: Trial, axis: Axis | None = None) -> Tracking:
@@ -200,10 +194,8 @@ def track_pixels(
     random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
-    quality = assess_points(
-        followed.edge_px, total_px, number, unsure=followed.unsure,
-        repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
-    )  # fmt: skip
+    end_px = strip.axis.length_px - followed.reach_px
+    quality = assess_points(followed.edge_px, total_px, number, unsure=followed.unsure, end_px=end_px)
     if quality.last_moving < 0:
         # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
         if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
@@ -225,9 +217,8 @@ def track_pixels(
     shake_px = np.zeros(frames.n_recorded)
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
-        track, strip.axis, kymograph.astype(np.float32), pictures, followed.blur_px, followed.exposure_frames, shake_px,
-        followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame,
-        strip_frames=number, ending=ending,
+        track, strip.axis, kymograph.astype(np.float32), number, pictures, followed.exposure_frames, shake_px,
+        followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame, ending,
     )  # fmt: skip
 
 
@@ -268,14 +259,11 @@ def _notes(
     name = frames.recording.path.name
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
-        frame, turns_back = int(number[followed.end[0]]), followed.end[1]
-        why = f"is not recognised after frame {frame}: it is gone, hidden or turned over"
-        if turns_back:
-            why = f"turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
-        notes.append(f"{name}: the body {why}")
+        why = f"turns back after frame {number[followed.end]}: a bounce, or the end of its motion"
+        notes.append(f"{name}: the body {why}; later frames are not used")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
-        ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
+        ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
     axis = followed.strip.axis
     if axis.bends and not axis_given:
         notes.append(
@@ -345,10 +333,8 @@ def in_metres(
     """A tracking in pixels with hand corrections, positions and errors in metres, times corrected for dropped and
     inserted frames, and notes on its end where that is not the end of the vine. Shapes: position_m (n, 2).
     """
-    ending, length_px = tracking.ending, trial.length_m / m_per_px
-    notes = [*tracking.track.notes]
-    notes[ending.place : ending.place] = ending.notes(length_px)
-    track = corrected_by_hand(replace(tracking.track, notes=tuple(notes)), trial.corrections)
+    notes = (*tracking.track.notes, *tracking.ending.notes(trial.length_m / m_per_px))
+    track = corrected_by_hand(replace(tracking.track, notes=notes), trial.corrections)
     position = track.edge_px * m_per_px
     local_m_per_px: Floats | float = m_per_px
     if position_m is not None:
