@@ -21,6 +21,7 @@ from vinetrack.video.axis import (
     axis_through,
     find_axis,
     front_share,
+    length_along,
     share_on_front,
 )
 from vinetrack.video.frames import RecordingError
@@ -183,7 +184,7 @@ def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
     """
     from scipy.interpolate import make_smoothing_spline
 
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    along = length_along(path)
     inner = (along >= spacing / 2) & (along <= along[-1] - spacing / 2)
     if inner.sum() < 5:
         return None

@@ -45,7 +45,6 @@ from vinetrack.video.edge_state import (
     seen_exposure,
 )
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import growth_end
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip, snap_to_grid
 
@@ -250,9 +249,7 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     rows = strip.values.shape[1]
     edge_rows, chosen = round((1 - 0.6) / 2 * rows), exited[np.unique(np.linspace(0, len(exited) - 1, 15).astype(int))]
     columns = slice(near[0] - beside, later[-1] + beside)
-    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
-    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
-    film_picture = np.asarray(np.median(level, axis=0), dtype=np.float32)
+    film_picture = np.median(strip.brightness(chosen, columns)[:, edge_rows : rows - edge_rows], axis=0)
     near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
     # Step of brightness across each column, by row; the first column is `beside`.
     sides = np.lib.stride_tricks.sliding_window_view(film_picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
@@ -296,9 +293,8 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
     changed = 0
     for column in column_range:
         arrival = int(np.searchsorted(rising, column - 5.0))
-        brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
-        frames = slice(first, first + len(brightness))
-        change = np.ptp(brightness * strip.scale[frames] + strip.offset[frames])
+        frames, here = slice(first, max(arrival - 1, first + 1)), slice(column, column + 1)
+        change = np.ptp(strip.brightness(frames, here).mean(axis=(1, 2)))
         # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
         # and by so many grey levels (chosen)
         changed += change > max(0.25 * contrast, 4.0)
@@ -325,24 +321,33 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
 
 
 # ------------------------------------------------------------------------------
-# Initial path of the front through a strip, before film, background or the tip are known.
+# Path of the front through a strip: the monotone path that best divides pixels that look like film from pixels that
+# look like background.
 #
-# Every pixel votes on whether it looks as in the first or as in the last frames; votes are equal, and a door that comes
-# to rest beside the tube has few rows. But a payload that has flown past by the end, or an object that stood in front
-# at the start, has no vote, and the path starts up to three frames late and ends up to three frames early, because
+# The first path knows neither, and takes the last frames for film and the first for background. An object that stood in
+# front at the start misleads it, and it starts up to three frames late and ends up to three frames early, because
 # several frames are averaged at either end.
 
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[np.float32]]:
-    """Find the initial path of the front and the columns that it leaves permanently changed; a payload may fly on
-    beyond the end of the film. Returns column of the front by frame, shape (n_frames,), px; first column passed, and
-    the one behind the last; and brightness of film and background, shape (2, n_across, n_along).
+    """Find the initial path of the front and the columns that it leaves permanently changed. Returns column of the
+    front by frame, shape (n_frames,), px; first column passed, and the one behind the last; and brightness of film and
+    background, shape (2, n_across, n_along).
     """
-    path, passed = _trim_to_changed_runs(*ky.path_by_appearance(strip))
-    end = growth_end(strip, path, passed)
-    if end <= passed[0]:
-        raise ValueError("what changes along the axis does not stay changed: nothing grows")
-    return path, (passed[0], end), initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2]
+    ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
+    last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
+    # Power of each column's change, of rows averaged in groups, over that of the noise
+    # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
+    group_size = int(np.clip(len(first) // 12, 1, 4))
+    grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
+    power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
+    # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
+    # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
+    weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
+    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
+    votes = [((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks]
+    path, passed = _trim_to_changed_runs(ky.dividing_path(np.stack(votes)), power)
+    return path, passed, initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2]
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -350,13 +355,11 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
     early one: neighbours then stand in for the background, whereas a column that never changed carries no information
     about the edge.
     """
-    # Length of a run of columns, and the fraction of it that must have changed for a front to have passed
-    # (chosen)
-    run_length_px, run_changed_part = 9, 0.6
     # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
+    # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
     strong = change > 70.0
-    run = np.convolve(strong, np.ones(run_length_px) / run_length_px, mode="same") > run_changed_part
-    if run.sum() < run_length_px:
+    run = np.convolve(strong, np.ones(9) / 9, mode="same") > 0.6
+    if run.sum() < 9:
         raise ValueError("nothing moves along the axis")
     changed_columns = np.flatnonzero(run & strong)
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
@@ -387,11 +390,12 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     """Track the leading edge of a tube through its strip, growing towards higher columns."""
     rounds = 4  # Fewest rounds of the alternation (chosen)
     path, passed = tube.path_px, tube.passed
-    path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
     for iteration in range(3):
-        before, path = path, _path_from_appearance(strip, state, passed)
+        contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
+        width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
+        before, path = path, _path_by_appearance(strip, state.appearance, width, passed)
         # 1.0: two paths are the same if they nowhere differ by more than this (derived)
         if iteration > 0 and np.abs(before - path).max() <= 1.0:
             break
@@ -574,14 +578,13 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
     return curve, float(np.abs(offsets).max())
 
 
-def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
-    """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
-    # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
-    # (chosen)
-    evidence_clip = 2.5
-    contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
-    width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
-    evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, state.appearance, width, evidence_clip)
+def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: float, passed: tuple[int, int]) -> Floats:
+    """Find the monotone path that best divides film from background between the columns that it passes. Distances from
+    either, in standard deviations of a pixel and of `width` together, are clipped, so that a door, a payload flying
+    ahead or a reflection cannot capture it.
+    """
+    # 2.5: standard deviations at which the difference of a pixel from film or background is clipped (chosen)
+    evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width, 2.5)
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 

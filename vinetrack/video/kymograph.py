@@ -1,27 +1,14 @@
-"""Initial path of the front: a monotone path through the kymograph (frame by column), by dynamic programming.
-
-A path is found in two passes. The first knows neither film nor background: `path_by_appearance` separates pixels that
-look as at the end of the recording from pixels that look as at its start. The second (`edge`) knows both and compares
-every pixel with them; distances are clipped, so that a door, a payload flying ahead or a reflection cannot capture the
-path.
-"""
+"""Compiled search for fronts: when each pixel changes, and monotone paths through what changes in order."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
-from vinetrack.video.edge_kernels import FASTMATH
-
-if TYPE_CHECKING:
-    from vinetrack.video.strip import Strip
-
-# ------------------------------------------------------------------------------
-# Compiled: the largest change of each pixel, and paths through pixels that change in order.
 
 
 @njit(nogil=True)
@@ -121,46 +108,6 @@ def collecting_path(score: NDArray[Any]) -> Floats:
     gains = np.zeros((len(score) + 1, score.shape[1]))
     gains[1:-1] = score[1:]
     return np.asarray(dividing_path(np.diff(gains, axis=0)))
-
-
-def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
-    """Find the front as the path that separates pixels that look as at the end from pixels that look as at the start.
-    The vote of a pixel is its distance from the final less that from the initial appearance, divided by the distance
-    between the two plus 4 times the noise: near −1 if it looks as at the end, near 1 if as at the start. Also returned
-    is the power of each column's change from start to end, of rows averaged in groups, over that of their noise.
-    """
-    first, last = _median_frame(strip, slice(0, END_FRAMES)), _median_frame(strip, slice(-END_FRAMES, None))
-    # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
-    votes = _votes(strip.values, strip.scale, strip.offset, first, last, 4.0 * strip.noise)
-    # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
-    group_size = int(np.clip(strip.values.shape[1] // 12, 1, 4))
-    grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
-    power = np.mean(grouped.mean(axis=1) ** 2, axis=0)
-    return dividing_path(votes), power / (strip.noise**2 / group_size)
-
-
-def _median_frame(strip: Strip, frames: slice) -> NDArray[np.float32]:
-    """Median brightness of every pixel over some frames, shape (n_across, n_along)."""
-    values = strip.values[frames] * strip.scale[frames, None, None].astype(np.float32)
-    values += strip.offset[frames, None, None].astype(np.float32)
-    return np.asarray(np.median(values, axis=0), np.float32)
-
-
-@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def _votes(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, softening: float
-) -> np.ndarray:
-    """Sum the votes of each column in each frame, shape (n_frames, n_along); see `path_by_appearance`."""
-    n, rows, columns = strip.shape
-    out = np.zeros((n, columns), np.float32)
-    weight = np.float32(1.0) / (np.abs(last - first) + np.float32(softening))
-    for t in range(n):
-        gain, level = np.float32(scale[t]), np.float32(offset[t])
-        for u in range(rows):
-            for s in range(columns):
-                value = np.float32(strip[t, u, s]) * gain + level
-                out[t, s] += (abs(value - last[u, s]) - abs(value - first[u, s])) * weight[u, s]
-    return out
 
 
 def column_after_leap(path: Floats) -> int:

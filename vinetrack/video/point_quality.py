@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
-from vinetrack.video.strip import Strip
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 FLOOR_PX = 0.04  # Standard error that no check shows
@@ -132,9 +131,6 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
 # an obstacle stops it, or when the recording ends.
 
 
-SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
-
-
 @dataclass(frozen=True)
 class Ending:
     """How an edge ends: its way from standstill to standstill, and until the last frame where it still moves there, px
@@ -187,55 +183,3 @@ def ending_of(
         else:
             remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
     return Ending(grown_px, truncated_px, remark, name)
-
-
-def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
-    """Column at which the film ends although something moves on; the end of `passed` where nothing does. Going
-    backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns that
-    look as they did before anything came, then film. Shapes: path (n_frames,).
-    """
-    # Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
-    film_parts = (0.7, 0.35, 0.175)
-    flight_speed_ratio = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
-    columns, frames = np.arange(passed[0], passed[1]), len(path)
-    if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
-        return passed[1]
-    arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
-    # Mean square over the rows of the last minus the first looks at each column, averaged over 5
-    last, difference = _mean(strip, slice(frames - 2, frames), columns), np.zeros(len(columns))
-    for when in np.unique(arrival):
-        those = arrival == when
-        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
-        difference[those] = np.mean((last[:, those] - before) ** 2, axis=0)
-    noise = strip.noise**2 * (0.5 + 0.2)
-    difference = np.convolve(np.clip(difference - noise, 0, None), np.ones(5) / 5, mode="same")
-    film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in film_parts)
-    # 0.2: share of the film's median difference from the background (chosen)
-    is_bare = difference < 0.2 * film_difference
-    # First of SHORTEST_BARE_PX or more bare columns in a row, with no more after it that are not bare than are across
-    film_after = np.cumsum(~is_bare[::-1])[::-1]
-    runs = np.convolve(is_bare, np.ones(SHORTEST_BARE_PX), mode="full")[SHORTEST_BARE_PX - 1 :] > SHORTEST_BARE_PX - 0.5
-    bare_from = int(np.argmax(runs & (film_after <= strip.values.shape[1])))
-    if bare_from < 3 * SHORTEST_BARE_PX or is_bare[bare_from - 2 * SHORTEST_BARE_PX : bare_from].mean() > 0.3:
-        return passed[1]
-    growth = _speed(arrival, bare_from - 6 * SHORTEST_BARE_PX, bare_from - 5)
-    flight = _speed(arrival, bare_from + 2, len(columns))
-    # An object that comes out is ahead of the film at once by its own length, however slowly it then flies.
-    exit_frame = int(arrival[bare_from])
-    leap = float(np.diff(path)[max(exit_frame - 2, 0) : exit_frame + 2].max(initial=0.0))
-    leaps = leap > max(flight_speed_ratio * growth, growth + SHORTEST_BARE_PX / 2)
-    flies_on = flight > flight_speed_ratio * growth or leaps
-    return int(columns[bare_from]) + 1 if flies_on else passed[1]
-
-
-def _speed(arrival: Indices, first: int, last: int) -> float:
-    """Mean speed between two columns, columns a frame."""
-    first, last = max(first, 0), min(last, len(arrival)) - 1
-    return (last - first) / max(float(arrival[last] - arrival[first]), 0.5)
-
-
-def _mean(strip: Strip, frames: slice, columns: Indices) -> NDArray[np.float32]:
-    """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
-    values = strip.values[frames][:, :, columns].astype(np.float32)
-    level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
-    return np.asarray(level.mean(axis=0), dtype=np.float32)

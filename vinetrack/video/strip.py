@@ -19,6 +19,7 @@ from vinetrack.video.axis import Axis
 from vinetrack.video.small_pictures import SmallPictures
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
+Picture = NDArray[np.float32]
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
 
 
@@ -36,6 +37,12 @@ class Strip:
     noise: float
     axis: Axis
     stabilised: bool
+
+    def brightness(self, frames: slice | Indices = slice(None), columns: slice | Indices = slice(None)) -> Picture:
+        """Grey levels of 255, free of flicker, of some frames and columns, shape (n_frames, n_across, n_columns)."""
+        values = self.values[frames][:, :, columns].astype(np.float32)
+        values *= self.scale[frames, None, None].astype(np.float32)
+        return np.asarray(values + self.offset[frames, None, None].astype(np.float32))
 
     def shake_along(self, edge_px: Floats) -> Floats:
         """How far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →
