@@ -219,8 +219,8 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
 
 DOMAINS = [
     learning.Domain((learning.Axis("growth", 0.0, 0.25, 24),)),
-    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8))),
-    learning.Domain((learning.Axis("time", 0.0, 0.4, 8), learning.Axis("pressure", 1e4, 3e4, 5))),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8, 8.0 / 1.3))),
+    learning.Domain((learning.Axis("time", 0.0, 0.4, 8, 0.4 / 0.1), learning.Axis("pressure", 1e4, 3e4, 5))),
 ]
 
 

@@ -304,7 +304,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monke
     assert frames.first <= moving[0] - 40
     assert frames.first + len(frames) > moving[-1] + 40
     assert len(frames) < len(moving) + 2 * (MARGIN_FRAMES + 60)
-    assert frames.n_recorded == len(long_frames)
+    assert len(frames.slots) == len(long_frames)
     same = slice(frames.first, frames.first + len(frames))
     assert np.array_equal(frames.luma, whole.luma[same])
     assert np.array_equal(frames.slot, whole.slot[same])
@@ -485,7 +485,7 @@ def test_only_the_sound_frames_before_the_damage_are_tracked(clip, tmp_path, fra
 @pytest.mark.parametrize("unused", ["frames_used", "damaged tail"])
 def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_one(clip, unused):
     kept = np.delete(np.arange(len(clip.frames)), 35)
-    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=np.arange(70), damaged=np.arange(70) >= 50)
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slots=np.arange(70), damaged=np.arange(70) >= 50)
     trial = clip.trial
     if unused == "frames_used":
         frames, trial = replace(frames, damaged=np.zeros(70, dtype=bool)), replace(trial, frames_used=(0, 49))
@@ -514,7 +514,7 @@ def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many():
 
 def test_frames_beyond_lost_ones_are_not_used(clip):
     kept = np.delete(np.arange(len(clip.frames)), np.arange(48, 58))
-    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slots=kept, damaged=np.zeros(len(kept), dtype=bool))
     track = track_frames(frames, clip.trial, CAPTURE_FPS).track
     assert not track.usable[48:].any()
     error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]

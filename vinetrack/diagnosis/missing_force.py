@@ -63,28 +63,28 @@ ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anyt
 LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
 
 
-# Variables taken as logarithms over most of their range, from 1 to 1 + 3 (chosen): speeds and durations of a campaign
-# span decades, and forces change over fractions of them
-LOGARITHMIC, LOG_RATIO = ("speed", "time"), 3.0
-
 # Splines along a variable, when it is alone and when it is one of two (chosen)
 SPLINES = {"growth": (24, 20), "speed": (16, 8), "time": (16, 8), "pressure": (7, 5)}
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A variable of a force, the range that was visited, SI, and the number of splines along it."""
+    """A variable of a force, the range that was visited, SI, and the number of splines along it. Where `log_ratio` is
+    not 0, it is taken as its logarithm from 1 to 1 + that: speeds and durations of a campaign span decades, and forces
+    change over fractions of them.
+    """
 
     name: str
     low: float
     high: float
     count: int
+    log_ratio: float = 0.0
 
     def part(self, at: Floats) -> Floats:
         """The variable scaled to 0 to 1 over the visited range. Shapes: at (n,) → (n,)."""
         part = (at - self.low) / (self.high - self.low)
-        if self.name in LOGARITHMIC:
-            part = np.log1p(LOG_RATIO * np.maximum(part, 0.0)) / math.log1p(LOG_RATIO)
+        if self.log_ratio:
+            part = np.log1p(self.log_ratio * np.maximum(part, 0.0)) / math.log1p(self.log_ratio)
         return np.asarray(part)
 
 
@@ -152,7 +152,7 @@ class Domain:
 
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     """Every variable alone, then every pair, over the ranges that the motions visit."""
-    ranges: dict[str, tuple[float, float]] = {}
+    ranges: dict[str, tuple[float, float, float]] = {}
     for name, attribute in VARIABLES.items():
         by_trial = [np.asarray(getattr(motion, attribute))[motion.is_visited] for motion in motions]
         # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
@@ -161,11 +161,16 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
         if high - low > 0.02 * abs(high):
             # 0.03: part by which the range of pressures is extended at both ends (chosen)
-            ranges[name] = (0.97 * low, 1.03 * high) if name == "pressure" else (low, high)
+            low, high = (0.97 * low, 1.03 * high) if name == "pressure" else (low, high)
+            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
+            typical = float(np.median([np.median(values) for values in by_trial]))
+            ranges[name] = low, high, (high - low) / typical if name in ("speed", "time") else 0.0
     choices = [*((name,) for name in ranges), *itertools.combinations(ranges, 2)]
-    return [
-        Domain(tuple(Axis(name, *ranges[name], SPLINES[name][len(names) - 1]) for name in names)) for names in choices
-    ]
+    domains = []
+    for names in choices:
+        limits = ((name, SPLINES[name][len(names) - 1], *ranges[name]) for name in names)
+        domains.append(Domain(tuple(Axis(name, low, high, count, ratio) for name, count, low, high, ratio in limits)))
+    return domains
 
 
 @dataclass(frozen=True)

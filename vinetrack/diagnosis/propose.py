@@ -37,8 +37,6 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misf
 from vinetrack.diagnosis.missing_force import (
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
-    LOG_RATIO,
-    LOGARITHMIC,
     VARIABLES,
     Domain,
     LearnedForce,
@@ -185,8 +183,8 @@ def _table_code(domain: Domain) -> list[str]:
     for depth, (axis, at, place, k) in enumerate(zip(domain.axes, "uv", "ij", "km", strict=False)):
         low, width = (repr(float(f"{value:.12g}")) for value in (axis.low, axis.high - axis.low))
         part = f"np.minimum(np.maximum((s.{_STATE[axis.name]} - {low}) / {width}, 0.0), 1.0)"
-        if axis.name in LOGARITHMIC:
-            part = f"np.log1p({LOG_RATIO} * {part}) / np.log1p({LOG_RATIO})"
+        if axis.log_ratio:
+            part = f"np.log1p({axis.log_ratio!r} * {part}) / np.log1p({axis.log_ratio!r})"
         lines += [
             f"{at} = {axis.count - 3}.0 * {part}",
             f"{place} = np.maximum(np.minimum(np.int64({at}), {axis.count - 4}), 0)",

@@ -116,6 +116,8 @@ def subset(
     )
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
     smaller.pressure_step, smaller.steps = predictor.pressure_step[rows], predictor.steps[columns]
+    smaller.has_pressure_deviation = predictor.has_pressure_deviation[rows]
+    smaller.has_damping_deviation = predictor.has_damping_deviation[rows]
     by_parameter = "prior_mean prior_precision lower upper free random"
     problem = replace(
         problem.of_trials(rows),

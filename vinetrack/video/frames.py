@@ -274,31 +274,25 @@ class Recording:
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames. `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape (n_frames,), is the
-    number of capture periods since the first frame, from timestamps or from the numbers of image files: 0, 1, 2 … if no
-    frame is missing.
+    """Decoded frames. `luma` has shape (n_frames, height, width), uint8 or uint16; the first is number `first` of those
+    recorded. `slots`, shape (n_recorded,), are the numbers of capture periods from the first frame recorded to each,
+    from timestamps or from the numbers of image files: 0, 1, 2 … if no frame is missing.
     """
 
     recording: Recording
     luma: NDArray[Any]
-    slot: Indices
+    slots: Indices
     damaged: Bools
     notes: tuple[str, ...] = ()
-    slots_before: Indices = field(default_factory=lambda: np.zeros(0, dtype=int))
-    slots_after: Indices = field(default_factory=lambda: np.zeros(0, dtype=int))
+    first: int = 0
 
     def __len__(self) -> int:
         return len(self.luma)
 
     @property
-    def first(self) -> int:
-        """Index of the first decoded frame in the recording, from 0."""
-        return len(self.slots_before)
-
-    @property
-    def n_recorded(self) -> int:
-        """Number of frames of the recording, decoded or not."""
-        return len(self.slots_before) + len(self.luma) + len(self.slots_after)
+    def slot(self) -> Indices:
+        """Slots of the decoded frames, shape (n_frames,)."""
+        return self.slots[self.first : self.first + len(self.luma)]
 
 
 def inspect_recording(path: Path | str) -> Recording:
@@ -461,8 +455,8 @@ def frames_at(recording: Recording, luma: NDArray[Any], times: NDArray[Any], num
         )
     notes += [irregular] if irregular else []
     return Frames(
-        recording, luma, slots[number], np.zeros(len(luma), dtype=bool),
-        tuple(f"{recording.path.name}: {note}" for note in notes), slots[:first], slots[last + 1 :],
+        recording, luma, np.concatenate([slots[:first], slots[number], slots[last + 1 :]]),
+        np.zeros(len(luma), dtype=bool), tuple(f"{recording.path.name}: {note}" for note in notes), first,
     )  # fmt: skip
 
 

@@ -102,7 +102,7 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
     # Lost frames, within the recording or at its end, count as damage.
     span = 1 + int(np.ptp(frames.slot[allowed]))
     if allowed.all():
-        span = max(span, (frames.recording.declared_frames or 0) - len(frames.slots_before) - len(frames.slots_after))
+        span = max(span, (frames.recording.declared_frames or 0) - len(frames.slots) + len(frames))
     complete = span < allowed.sum() / LEAST_PART
     # 3: most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
     if complete and not damaged.any() and np.max(np.diff(frames.slot[allowed]), initial=1) <= 3 + 1:
@@ -213,7 +213,7 @@ def track_pixels(
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
     kymograph = strip.values.mean(axis=1, dtype=np.float32) * strip.scale[:, None] + strip.offset[:, None]
-    shake_px = np.zeros(frames.n_recorded)
+    shake_px = np.zeros(len(frames.slots))
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
         track, strip.axis, kymograph.astype(np.float32), number, pictures, followed.exposure_frames, shake_px,
@@ -229,7 +229,7 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"only {len(frames)} frames can be decoded", f"at least {FEWEST_FRAMES} are needed", name)
     odd = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
-    first, last = trial.frames_used or (0, frames.n_recorded - 1)
+    first, last = trial.frames_used or (0, len(frames.slots) - 1)
     number = frames.first + np.arange(len(frames))
     allowed: Bools = (number >= first) & (number <= last)
     if allowed.sum() < FEWEST_FRAMES:
@@ -261,7 +261,7 @@ def _notes(
         why = f"turns back after frame {number[followed.end]}: a bounce, or the end of its motion"
         notes.append(f"{name}: the body {why}; later frames are not used")
     else:
-        whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
+        whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == len(frames.slots) - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
     axis = followed.strip.axis
     if axis.bends and not axis_given:
@@ -306,20 +306,17 @@ def _assemble(
     capture_fps: float, exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
     """The track in pixels, a row for every frame; rejected and later frames have no position."""
-    n = len(frames)
+    n, number = len(frames.slots), frames.first + rows
     edge, noise, slow = np.full((3, n), np.nan)
     flag = np.full(n, "rejected", dtype="<U64")
-    flag[int(rows[-1]) + 1 :] = "after_end"
-    flag[frames.damaged] = "rejected"
-    edge[rows] = np.where(quality.without_edge, np.nan, followed.edge_px)
-    noise[rows], slow[rows] = np.where(quality.without_edge, np.nan, errors_px)
-    flag[rows] = quality.flag
-    # Frames before and after the event were not decoded, since nothing moves in them; they have rows as well.
-    before, after = frames.slots_before, frames.slots_after
-    slot = np.concatenate([before, frames.slot, after])
-    flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
-    edge, noise, slow = np.pad([edge, noise, slow], ((0, 0), (len(before), len(after))), constant_values=np.nan)
-    time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
+    # Frames before and after the event were not decoded, since nothing moves in them.
+    flag[: frames.first] = "before_release"
+    flag[number[-1] + 1 :] = "after_end"
+    flag[frames.first + np.flatnonzero(frames.damaged)] = "rejected"
+    edge[number] = np.where(quality.without_edge, np.nan, followed.edge_px)
+    noise[number], slow[number] = np.where(quality.without_edge, np.nan, errors_px)
+    flag[number] = quality.flag
+    time = frames.slots / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
     return Track(
         time, np.full(len(edge), np.nan), noise, flag.astype("<U64"), edge, notes=tuple(notes),
         lead_position_systematic_m=slow,
