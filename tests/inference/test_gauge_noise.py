@@ -11,8 +11,8 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 import vinetrack as vt
 from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
+from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.position_errors import with_systematics
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import ar1_noise

@@ -11,10 +11,10 @@ from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference import marginal_likelihood as marginal
+from vinetrack.inference.errors import degrees_of_freedom, precision
 from vinetrack.inference.fit_result import _deviate
 from vinetrack.inference.gaussian_processes import all_products, at_correlation, products, whiten
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
-from vinetrack.inference.position_errors import degrees_of_freedom, precision
 
 RHO, SIGMA = 0.45, 0.3
 

@@ -12,8 +12,7 @@ from scipy.stats import t as student
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.locate import against_the_sheet
-from vinetrack.inference import fit_result, optimiser, position_errors
-from vinetrack.inference import robust_covariance as sandwich
+from vinetrack.inference import errors, fit_result, optimiser
 from vinetrack.inference.optimiser import solve
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 
@@ -51,7 +50,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
     by_noise, stated = [], []
     for seed in seeds:
         found = vt.fit(vt.base_model(), make(seed), profile=False)
-        narrow = np.sqrt(np.diag(position_errors.precision(found.solution).covariance))
+        narrow = np.sqrt(np.diag(errors.precision(found.solution).covariance))
         for k, number in enumerate(found.numbers):
             if number.key == "yield_pressure.P_y":
                 continue
@@ -72,10 +71,10 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies():
     What trials err by together, which here is more, is left aside.
     """
     found = vt.fit(vt.base_model(), unlike(20620), profile=False)
-    plain, robust = (np.diag(matrix) for matrix in sandwich.robust_covariance(found.predictor, found.solution))
+    plain, robust = (np.diag(matrix) for matrix in errors.robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
-    known = position_errors.precision(found.solution)
-    stated = np.diag(sandwich.widened_covariance(found.predictor, found.solution, known, ()).covariance)
+    known = errors.precision(found.solution)
+    stated = np.diag(errors.widened_covariance(found.predictor, found.solution, known, ()).covariance)
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
 
 
@@ -89,7 +88,7 @@ def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
     for _ in range(3000):
         values = 0.2 * draw.standard_normal(trials)
         scores = 25.0 * (values - values.mean())[:, None]
-        variance, degrees = sandwich._few_trial_variances(information, scores, solution, plain)
+        variance, degrees = errors._few_trial_variances(information, scores, solution, plain)
         assert degrees[0] == pytest.approx(trials - 1)
         found.append(variance[0])
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)
@@ -130,14 +129,14 @@ def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighte
 def test_the_coarsest_sufficient_groups_are_used(specimens, days, groups):
     told = [(f"s{i % specimens}" if specimens else "", f"{i % days}" if days else "") for i in range(24)]
     trials = [Trial(name=f"t{i}", vine="v", specimen=one, day=day) for i, (one, day) in enumerate(told)]
-    assert len(set(sandwich.coarsest_groups(trials))) == groups
+    assert len(set(errors.coarsest_groups(trials))) == groups
 
 
 def test_errors_shared_by_a_group_enter_the_covariance():
     draw, groups, seen = np.random.default_rng(7), [f"s{i % 12:02}" for i in range(48)], []
     for _ in range(400):
         single = np.tile(draw.standard_normal((12, 1)), (4, 1)) + 0.1 * draw.standard_normal((48, 1))
-        seen.append(sandwich.group_scatter(single - single.mean(axis=0), groups, 1)[0, 0])
+        seen.append(errors.group_scatter(single - single.mean(axis=0), groups, 1)[0, 0])
     # 12 groups of 4 with a shared error of variance 1 and single ones of 0.01: 12 · 16 + 48 · 0.01.
     assert abs(np.mean(seen) / 192.5 - 1) < 0.05
 
@@ -147,10 +146,10 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
     found = vt.fit(vt.base_model(), bent(pairs, bends_m), profile=False)
-    alone = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
+    alone = np.diag(errors.robust_covariance(found.predictor, found.solution)[1])
     told = enumerate(found.predictor.data)
     found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
-    by_day = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
+    by_day = np.diag(errors.robust_covariance(found.predictor, found.solution)[1])
     assert np.all(by_day >= alone)
     assert np.max(by_day / alone) > 1.2
 
@@ -165,7 +164,7 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
     B = found["B"]
-    assert position_errors.precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
+    assert errors.precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
     standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)
     half_width = math.log(B.high / B.low) / 2

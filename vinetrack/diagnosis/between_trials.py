@@ -37,11 +37,11 @@ from vinetrack.diagnosis.result import (
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
+from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.position_errors import with_systematics
 
 # ------------------------------------------------------------------------------
 # Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.

@@ -30,11 +30,11 @@ from vinetrack.diagnosis.score_test import Products, products_without_trial_effe
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
+from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, at_unknowns, solve_per_trial
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.position_errors import with_systematics
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.candidate_trials import (

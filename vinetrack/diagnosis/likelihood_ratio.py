@@ -17,6 +17,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
 from vinetrack.diagnosis.score_test import is_plausible, plausible_range, slip_of
 from vinetrack.effects import Effect, Parameter
+from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_covariance, with_systematics
 from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.marginal_likelihood import (
@@ -25,8 +26,6 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
 )
 from vinetrack.inference.optimiser import Solution, is_poor_fit
-from vinetrack.inference.position_errors import with_systematics
-from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
 from vinetrack.inference.systematics import systematics_of, with_unknowns
 

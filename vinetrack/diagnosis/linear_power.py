@@ -38,12 +38,12 @@ from vinetrack.diagnosis.score_test import (
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect
 from vinetrack.experiment.schema import GROUPINGS
+from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
-from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.planning.candidate_trials import at_solution, extended_fit

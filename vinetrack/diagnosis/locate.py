@@ -38,9 +38,9 @@ from vinetrack.diagnosis.replicates import (
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
+from vinetrack.inference.errors import robust_covariance
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
-from vinetrack.inference.robust_covariance import robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
 
 if TYPE_CHECKING:

@@ -32,9 +32,9 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
+from vinetrack.inference.errors import FEWEST_CLUSTERS, cluster_variance
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit, relative_residual
-from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, cluster_variance
 from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 
 # ------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model, check_needs, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
+from vinetrack.inference.errors import cluster_variance, coarsest_groups
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names
 from vinetrack.inference.gaussian_processes import all_products
@@ -37,7 +38,6 @@ from vinetrack.inference.marginal_likelihood import (
     summed,
     trial_effects_eliminated,
 )
-from vinetrack.inference.robust_covariance import cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.systematics import Systematics
 

@@ -26,6 +26,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
+from vinetrack.inference.errors import Pooled, pool, student, trial_information
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import at_correlation, whiten
@@ -42,7 +43,6 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.position_errors import Pooled, pool, student, trial_information
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 #     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 #
 # δθ is the error of the shared parameters, u the difference of the trial's parameters from those
-# (`position_errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
+# (`errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
 # position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of the model along each
 # trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal of
 #

@@ -19,6 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
+from vinetrack.inference.errors import robust_covariance, trial_information, with_systematics
 from vinetrack.inference.fit_result import (
     BetweenTrialSpread,
     Fit,
@@ -28,8 +29,6 @@ from vinetrack.inference.fit_result import (
     TrialEstimates,
     numbers_text,
 )
-from vinetrack.inference.position_errors import trial_information, with_systematics
-from vinetrack.inference.robust_covariance import robust_covariance
 from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 
 # ------------------------------------------------------------------------------

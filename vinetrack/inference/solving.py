@@ -14,6 +14,19 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import values_by_key
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.errors import (
+    Pooled,
+    Precision,
+    WithSystematics,
+    near_bound,
+    pool,
+    precision,
+    profile_interval,
+    student,
+    too_few_clusters,
+    widened_covariance,
+    with_systematics,
+)
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import (
     YIELD_PRESSURE,
@@ -43,18 +56,6 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.position_errors import (
-    Pooled,
-    Precision,
-    WithSystematics,
-    near_bound,
-    pool,
-    precision,
-    profile_interval,
-    student,
-    with_systematics,
-)
-from vinetrack.inference.robust_covariance import too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
