@@ -164,7 +164,7 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
             low, high = (0.97 * low, 1.03 * high) if name == "pressure" else (low, high)
             # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
             typical = float(np.median([np.median(values) for values in by_trial]))
-            ranges[name] = low, high, (high - low) / typical if name in ("speed", "time") else 0.0
+            ranges[name] = low, high, (high - low) / (typical or high) if name in ("speed", "time") else 0.0
     choices = [*((name,) for name in ranges), *itertools.combinations(ranges, 2)]
     domains = []
     for names in choices:

@@ -420,7 +420,7 @@ class Scatter:
     def covariance(self, response_m: Floats, noise_m2: Floats) -> Floats:
         """Covariance of the means of one trial's stretches, m². Shapes: response_m (n, 2), noise_m2 (n, n) → (n, n)."""
         shared = response_m * (self.pressure**2, self.damping**2) @ response_m.T
-        residual = self.residual**2 * float(np.trace(shared)) / len(shared)
+        residual = self.residual**2 * float(np.trace(shared)) / max(len(shared), 1)
         # 1e-6: lower limit of the error of a stretch mean, m (chosen)
         return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 

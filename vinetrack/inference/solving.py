@@ -105,10 +105,13 @@ def _solve_or_alike(
     if fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
         return solution
     # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
-    alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
-    if is_poor_fit(predictor, alike):
-        return alike
-    return solve(predictor, problem, alike.state, fixed_terms, **{**how, "warm": True})
+    try:
+        alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
+        if is_poor_fit(predictor, alike):
+            return alike
+        return solve(predictor, problem, alike.state, fixed_terms, **{**how, "warm": True})
+    except SimulationError:
+        return solution
 
 
 def solve_onward(

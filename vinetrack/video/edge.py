@@ -293,8 +293,8 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
     changed = 0
     for column in column_range:
         arrival = int(np.searchsorted(rising, column - 5.0))
-        frames, here = slice(first, max(arrival - 1, first + 1)), slice(column, column + 1)
-        change = np.ptp(strip.brightness(frames, here).mean(axis=(1, 2)))
+        frames = slice(first, max(arrival - 1, first + 1))
+        change = np.ptp(strip.brightness(frames, np.array([column])).mean(axis=(1, 2)))
         # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
         # and by so many grey levels (chosen)
         changed += change > max(0.25 * contrast, 4.0)
