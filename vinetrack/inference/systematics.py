@@ -172,9 +172,7 @@ def _gauge_errors(predictor: Predictor, solution: Solution) -> Displaced:
 
 
 def _lens_errors(predictor: Predictor, solution: Solution) -> Displaced:
-    """Smooth errors of position that all trials of a camera share: Legendre polynomials of order 1 to 4 over the
-    growth, each minus its value where the edge rests, of standard deviation `position_systematic_mm`.
-    """
+    """Smooth errors of position that all trials of a camera share."""
     return {i: ("", shapes) for i, shapes in enumerate(position_shapes(predictor, grown_in(predictor, solution)))}
 
 
