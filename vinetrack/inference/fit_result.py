@@ -393,7 +393,7 @@ class TrialEstimates:
 @dataclass(frozen=True, kw_only=True)
 class TrialFit(TrialEstimates):
     """One trial under the model; arrays have shape (n_points,), at the points that were used. `whitened` are whitened
-    residuals, without smooth errors of position, in standard deviations.
+    residuals, without systematic errors, in standard deviations.
     """
 
     trial: Trial

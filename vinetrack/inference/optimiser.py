@@ -210,9 +210,8 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts. Smooth
-    errors of position (`vinetrack.inference.errors`) are fitted after the last step and change the reported
-    values slightly.
+    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts.
+    Systematic errors are fitted after the last step and change the reported values slightly.
     """
 
     iteration: int
