@@ -220,8 +220,8 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     """What trials scatter more than the noise says is taken off; as a variance it counts six times at most."""
     after = known_fit(-100.0, number_of("air_drag.C_D", 1.0, 0.1))
     after.trials, after.predictor, after.solution = (None,) * 12, None, None
-    scattered = (np.diag([0.01]), np.diag([0.01 * ratio**2]))
-    monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_covariance", lambda *_: scattered)
+    scattered = (np.diag([0.01]), np.array([0.01 * ratio**2]), np.array([5.0]))
+    monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_variances", lambda *_: scattered)
     found = ratios.likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
     assert found.delta_chi2 == pytest.approx(100.0)
     assert found.sigma == pytest.approx(10.0 / max(ratio, 1.0))

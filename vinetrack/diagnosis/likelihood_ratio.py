@@ -17,7 +17,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
 from vinetrack.diagnosis.score_test import is_plausible, plausible_range, slip_of
 from vinetrack.effects import Effect, Parameter
-from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_covariance, with_systematics
+from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances, with_systematics
 from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.marginal_likelihood import (
@@ -402,14 +402,13 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     """
     if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
-    matrices = robust_covariance(after.predictor, after.solution)
-    plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
-    chosen = [
-        k
+    plain, variance, _ = robust_variances(after.predictor, after.solution)
+    ratios = [
+        float(variance[k] / plain[k, k])
         for k, number in enumerate(after.numbers)
-        if (number.key.split(".")[0] in names or number.key in names) and plain[k] > 0
+        if (number.key.split(".")[0] in names or number.key in names) and plain[k, k] > 0
     ]
-    return max([1.0, *(float(robust[k] / plain[k]) for k in chosen)])
+    return math.sqrt(max([1.0, *ratios]))
 
 
 def _distance(fit: Fit, other: Fit) -> float:

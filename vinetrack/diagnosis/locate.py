@@ -38,7 +38,7 @@ from vinetrack.diagnosis.replicates import (
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
-from vinetrack.inference.errors import robust_covariance
+from vinetrack.inference.errors import robust_variances
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
@@ -492,7 +492,7 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
     fit adds to σ² for scatter and shared errors comes on top.
     """
-    plain = np.diag(robust_covariance(fit.predictor, fit.solution)[0])
+    plain = np.diag(robust_variances(fit.predictor, fit.solution)[0])
     for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
         if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:

@@ -19,20 +19,17 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
-    DEVIATION_COLUMNS,
     FitState,
     Marginal,
     MixedProblem,
     at_unknowns,
     deviance,
-    estimate_noise,
     inverse_of_block,
     levenberg_marquardt_step,
     log_likelihood,
     marginal,
     matrix_root,
     normal_equations,
-    trial_effect_step,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import (
@@ -42,9 +39,8 @@ from vinetrack.inference.optimiser import (
     solve,
     update_variances,
     variance_change,
-    variance_floor,
 )
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
+from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
@@ -351,126 +347,6 @@ def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
     return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
 
 
-# ------------------------------------------------------------------------------
-# Pooling of few trials that disagree: a between-trial variance of the shared parameters sets the weights of trials.
-#
-# A fit gives every trial a noise of its own, and some trials a deviation of B and pressure. Where trials differ in a
-# parameter that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the
-# smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights
-# further. So:
-#
-# 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too.
-# 2. The parameters θ_i of trial i scatter about the shared θ, θ_i ~ N(θ, τ² M), with M the covariance of a typical
-#    trial alone, by its noise, and τ² at the maximum of the restricted likelihood.
-
-
-@dataclass(frozen=True)
-class Pooled:
-    """Shared parameters with trials weighted by noise and disagreement, scaled. `solution` is the state at these
-    parameters, with the systematic errors as further ones.
-    """
-
-    solution: Solution
-    information: Floats
-    scores: Floats
-    covariance: Floats
-    between: Floats
-
-
-def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
-    """Estimate the shared parameters with trials weighted by noise and disagreement."""
-    if len(predictor.data) < 2:
-        return None
-    errors = systematics_of(predictor, solution)
-    problem = errors.among(solution.problem)
-    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(errors.count)))
-    columns: Sequence[Floats] = solution.columns
-    # 12, 0.05: maximum number of steps, and the length of a step in standard errors at which they have converged
-    # (chosen)
-    for _ in range(12):
-        extended = errors.beside(columns, state.theta[shared:])
-        cross_products = predictor.products(extended)
-        rho, variance = estimate_noise(cross_products, problem, state, within=True)
-        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-        pooled = _with_weights(
-            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(extended)),
-            shared,
-        )
-        pull = problem.prior_precision * (state.theta - problem.prior_mean)
-        step = pooled.covariance @ (pooled.scores.sum(axis=0) - pull)
-        scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
-        longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
-        sigma = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
-        if float(np.max(np.abs(step) / sigma, initial=0.0)) < 0.05:
-            return pooled
-        # 3.0: longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
-        step = step * min(1.0, 3.0 / longest)
-        state = _state_after_step(pooled.solution, state, step)
-        # 3.0: deviation of a trial's ln B, or relative one of its pressure, at which a step has left the
-        # region in which the model is nearly linear (chosen)
-        if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > 3.0:
-            return None
-        try:
-            columns = predictor.linearise(state.theta[:shared], state.trial_effects)
-        except SimulationError:
-            return None
-    return None
-
-
-def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:
-    """The state after a step, with the effects of the trials following to first order."""
-    problem = solution.problem
-    theta = np.clip(state.theta + step, problem.lower, problem.upper)
-    change = np.append(theta - state.theta, 0.0)[problem.index]
-    moved_products = _products_after_step(solution.cross_products, np.pad(change, ((0, 0), (N_TRIAL_EFFECTS, 0))))
-    trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)[0]
-    return replace(state, theta=theta, trial_effects=trial_effects)
-
-
-def _with_weights(solution: Solution, shared: int) -> Pooled:
-    """The pooled fit at a state, with τ² at the maximum of its restricted likelihood."""
-    problem, state = solution.problem, solution.state
-    size = problem.prior_mean.size
-    information, scores = trial_information(solution)
-    total = information.sum(axis=0) + np.diag(problem.prior_precision)
-    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    estimated = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    root = _typical_root(inverse_of_block(total, estimated), information, shared)
-    values, vectors = np.linalg.eigh(information)
-    information_roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    # With J = H Hᵀ and Hᵀ R = U S Vᵀ, R the root of M, (J⁻¹ + τ²M)⁻¹ = H U (1 + τ²S²)⁻¹ Uᵀ Hᵀ for any τ²: J − J(…)J
-    # would lose all digits of a parameter on which trials disagree to cancellation.
-    rotation, singular_values, _ = np.linalg.svd(np.swapaxes(information_roots, 1, 2) @ root)
-    rotated_roots = information_roots @ rotation
-    # 1e-12: least information of a trial on a direction that counts, relative to its largest (derived)
-    determined = values > 1e-12 * values[:, -1:]
-    score_parts = np.where(determined, 1 / np.sqrt(np.where(determined, values, 1.0)), 0.0) * np.einsum(
-        "nij,ni->nj", vectors, scores
-    )
-    score_rest = scores - np.einsum("nij,nj->ni", information_roots, score_parts)
-    score_parts = np.einsum("nij,ni->nj", rotation, score_parts)
-    stacked = np.swapaxes(rotated_roots, 1, 2).reshape(-1, size)
-    prior = np.diag(problem.prior_precision)
-    offset = problem.prior_precision * (state.theta - problem.prior_mean) - score_rest.sum(axis=0)
-
-    def deviance(tau2: float) -> float:
-        shrinkage = 1 / (1 + tau2 * singular_values**2)
-        total_information = ((stacked * shrinkage.reshape(-1, 1)).T @ stacked + prior)[np.ix_(estimated, estimated)]
-        slope = ((shrinkage * score_parts).ravel() @ stacked - offset)[estimated]
-        scale = 1 / np.sqrt(np.diag(total_information))
-        scaled = total_information * scale[:, None] * scale
-        decrease = float((scale * slope) @ np.linalg.lstsq(scaled, scale * slope, rcond=1e-11)[0])
-        log_det = float(np.linalg.slogdet(total_information)[1]) - float(np.sum(np.log(shrinkage)))
-        return log_det - float(np.sum((1 - shrinkage) * score_parts**2)) - decrease
-
-    tau2 = _maximise_likelihood(deviance) if estimated.size else 0.0
-    shrinkage = 1 / (1 + tau2 * singular_values**2)
-    weight = (rotated_roots * shrinkage[:, None, :]) @ np.swapaxes(rotated_roots, 1, 2)
-    score = np.einsum("nij,nj->ni", rotated_roots, shrinkage * score_parts) + score_rest
-    covariance = inverse_of_block(weight.sum(axis=0) + prior, estimated)
-    return Pooled(solution, weight, score, covariance, tau2 * root @ root.T)
-
-
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     """Information and scores of each trial on the free parameters, its trial effects integrated out. Returns
     information, scores. Shape (n_trials, n_free, n_free).
@@ -482,80 +358,84 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     return placed[:, :-1, :-1], placed[:, :-1, -1]
 
 
-def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:
-    """A root of M: the covariance of all trials times the number of trials that depend on a parameter."""
-    informative_trials = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
-    informative_trials[shared:] = 0.0
-    factor = np.sqrt(informative_trials)
-    return matrix_root(covariance * factor[:, None] * factor)
-
-
-def _maximise_likelihood(deviance: Callable[[float], float]) -> float:
-    """The τ² of lowest deviance: 0, or the lowest of a grid, refined."""
-    from scipy.optimize import minimize_scalar
-
-    # 1e6: largest τ², in variances of one trial by its noise (chosen)
-    logs = np.linspace(math.log(1e-2), math.log(1e6), 24)
-    levels = [deviance(math.exp(log)) for log in logs]
-    best = int(np.argmin(levels))
-    low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]
-    minimum = minimize_scalar(lambda log_tau2: deviance(math.exp(log_tau2)), bounds=(low, high), method="bounded")
-    return float(math.exp(minimum.x)) if minimum.fun < deviance(0.0) else 0.0
-
-
 # ------------------------------------------------------------------------------
-# Robust covariance of the parameters of a fit, from the scatter of trials.
+# Errors from the scatter of trials.
 #
 # The inverse information is the covariance only if noise and between-trial variation are as modelled. The scatter of
-# the scores of single trials gives a cluster-robust (sandwich) covariance (White, Econometrica 48, 817, 1980, with
-# trials as clusters), which only ever widens an error.
+# the scores of single trials, or of the specimens or days that they share, gives a variance that only ever widens an
+# error: the cluster-robust sandwich, without bias and with Satterthwaite degrees of freedom for few clusters (CR2: Bell
+# & McCaffrey, Survey Methodology 28, 169, 2002).
 
-FEWEST_CLUSTERS = 8  # Trials from which the sandwich is better than the model of the noise (chosen)
-
-FEWEST_DEGREES = 4  # Trials beyond the number of parameters that a sandwich needs (chosen)
+FEWEST_CLUSTERS = 8  # Clusters from which their scatter counts in tests of a model (chosen)
 
 
-def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floats:
-    """Variance of sums over trials, from the scatter of single trials or, where that is larger, of their clusters
-    (`coarsest_groups`); 0 where trials are too few. Shapes: single (n_trials, n) → (n,).
+def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats, Floats]:
+    """Covariance of the free parameters by the noise model, (n_free, n_free); their variances from the scatter of
+    trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,). Parameters at a
+    bound are fixed there.
     """
-    trials = len(single)
-    if trials < FEWEST_CLUSTERS:
-        return np.zeros(single.shape[1])
-    single = single - single.mean(axis=0)
-    return np.max([np.diag(group_scatter(single, each, fitted)) for each in (range(trials), groups)], axis=0)
+    problem, theta = solution.problem, solution.state.theta
+    information, scores = trial_information(solution)
+    square = information.sum(axis=0) + np.diag(problem.prior_precision)
+    inside = (theta > problem.lower) & (theta < problem.upper)
+    estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
+    plain = inverse_of_block(square, estimated)
+    # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
+    depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
+    scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
+    variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
+    trials = [trial_data.trial for trial_data in predictor.data]
+    for groups in (range(len(trials)), coarsest_groups(trials)):
+        by_scatter = scatter_variances(*(_summed_over(groups, each) for each in (information, scores)), problem, plain)
+        larger = by_scatter[0] > variance
+        variance, degrees = (
+            np.where(larger, new, old) for new, old in zip(by_scatter, (variance, degrees), strict=True)
+        )
+    return plain, variance, degrees
 
 
-def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
-    """Whether there are too few trials for a sandwich covariance."""
-    spare = len(predictor.data) - np.count_nonzero(solution.problem.free)
-    return len(predictor.data) < FEWEST_CLUSTERS or bool(spare < FEWEST_DEGREES)
+def scatter_variances(
+    information: Floats, scores: Floats, problem: MixedProblem, plain: Floats
+) -> tuple[Floats, Floats]:
+    """Variances of the free parameters from the disagreement of clusters, and their degrees of freedom. Each cluster
+    pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in units of the
+    errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i). Shapes: information
+    (n_clusters, n_free, n_free); scores (n_clusters, n_free); plain (n_free, n_free) → (n_free,), (n_free,).
+    """
+    variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
+    estimated = np.flatnonzero(np.diag(plain) > 0)
+    if not estimated.size or len(scores) < 2:
+        return variance, degrees
+    root = matrix_root(plain[np.ix_(estimated, estimated)])
+    score = scores[:, estimated] @ root
+    shares = root.T @ information[:, estimated[:, None], estimated] @ root
+    values, vectors = np.linalg.eigh(shares)
+    # 0.99: share of the information on a direction from which one cluster is practically the only one to determine it
+    # (chosen)
+    shown = np.where(values < 0.99, 1 / np.sqrt(1 - np.clip(values, 0.0, 0.99)), 0.0)
+    adjustments = (vectors * shown[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    hidden = (vectors * np.where(values < 0.99, 0.0, values)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    constant = root.T @ np.diag(problem.prior_precision[estimated]) @ root + hidden.sum(axis=0)
+    for k, place in enumerate(estimated.tolist()):
+        weights_of_score = adjustments @ root[k]
+        scatter = float(np.sum(np.einsum("nk,nk->n", weights_of_score, score) ** 2))
+        moved = np.einsum("nij,nj->ni", shares, weights_of_score)
+        expected = np.diag(np.einsum("ni,ni->n", weights_of_score, moved)) - moved @ moved.T
+        squares = float(np.sum(expected**2))
+        variance[place] = scatter + float(root[k] @ constant @ root[k])
+        if squares > 0 and scatter > 0:
+            degrees[place] = max(np.trace(expected) ** 2 / squares * (variance[place] / scatter) ** 2, 1.0)
+    return variance, degrees
 
 
 def widened_covariance(
-    predictor: Predictor,
-    solution: Solution,
-    model_precision: Precision,
-    sources: Sequence[str],
-    pooled: Pooled | None = None,
+    predictor: Predictor, solution: Solution, model_precision: Precision, sources: Sequence[str]
 ) -> Precision:
     """Covariance and degrees of freedom at the end of a fit with its systematic errors, the last unknowns, widened by
     the scatter of trials. `sources` are where each of these errors comes from.
     """
-    plain, robust = robust_covariance(predictor, solution)
-    at_most, trials = model_precision.degrees, len(predictor.data)
-    spare = trials - estimated_unknowns(solution, plain)
-    if pooled is None and trials >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
-        variance = np.diag(robust)
-        clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
-        few = np.full(variance.size, min(spare, clusters - 1.0))
-    elif pooled is None:
-        variance, few = _few_trial_variances(*trial_information(solution), solution, plain)
-    else:
-        plain = pooled.covariance
-        variance, few = _few_trial_variances(pooled.information, pooled.scores, solution, plain)
-        at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
-    diagonal = np.diag(plain)
+    plain, variance, few = robust_variances(predictor, solution)
+    diagonal, at_most = np.diag(plain), model_precision.degrees
     ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
     degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
     covariance = (
@@ -572,75 +452,6 @@ def widened_covariance(
     return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
 
 
-def estimated_unknowns(solution: Solution, covariance: Floats) -> float:
-    """How many unknowns the trials determine: each counts by the part of its information that is not its prior's."""
-    by_prior = solution.problem.prior_precision * np.diag(covariance)
-    return float(np.sum(np.where(np.diag(covariance) > 0, 1 - by_prior, 0.0)))
-
-
-def _few_trial_variances(
-    information: Floats, scores: Floats, solution: Solution, plain: Floats
-) -> tuple[Floats, Floats]:
-    """Variances of the free parameters from the disagreement of few trials, without bias, and their degrees of freedom.
-    Each trial pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in
-    units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i) (CR2: Bell &
-    McCaffrey, Survey Methodology 28, 169, 2002). Returns variance, degrees : arrays, shape (n_free,), of scaled
-    parameters. Shapes: plain (n_free, n_free).
-    """
-    variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
-    estimated = np.flatnonzero(np.diag(plain) > 0)
-    if not estimated.size or len(scores) < 2:
-        return variance, degrees
-    root = matrix_root(plain[np.ix_(estimated, estimated)])
-    score = (scores - scores.mean(axis=0))[:, estimated] @ root
-    shares, adjustments = [], []
-    constant = root.T @ np.diag(solution.problem.prior_precision[estimated]) @ root
-    for single in information:
-        share = root.T @ single[np.ix_(estimated, estimated)] @ root
-        values, vectors = np.linalg.eigh(share)
-        # 0.99: share of the information on a direction from which one trial is practically the only one to
-        # determine it (chosen)
-        below_limit = values < 0.99
-        adjustments.append(
-            (vectors[:, below_limit] / np.sqrt(1 - np.maximum(values[below_limit], 0.0))) @ vectors[:, below_limit].T
-        )
-        constant = constant + (vectors[:, ~below_limit] * values[~below_limit]) @ vectors[:, ~below_limit].T
-        shares.append(share)
-    for k, place in enumerate(estimated.tolist()):
-        weights_of_score = np.array([adjustment @ root[k] for adjustment in adjustments])
-        scatter = float(np.sum(np.einsum("nk,nk->n", weights_of_score, score) ** 2))
-        moved = np.einsum("nij,nj->ni", np.array(shares), weights_of_score)
-        expected = np.diag(np.einsum("ni,ni->n", weights_of_score, moved)) - moved @ moved.T
-        squares = float(np.sum(expected**2))
-        variance[place] = scatter + float(root[k] @ constant @ root[k])
-        if squares > 0 and scatter > 0:
-            degrees[place] = max(np.trace(expected) ** 2 / squares * (variance[place] / scatter) ** 2, 1.0)
-    return variance, degrees
-
-
-def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
-    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials, shape
-    (n_free, n_free) each. Parameters at a bound are fixed there.
-    """
-    problem, theta = solution.problem, solution.state.theta
-    information, scores = trial_information(solution)
-    square = information.sum(axis=0) + np.diag(problem.prior_precision)
-    inside = (theta > problem.lower) & (theta < problem.upper)
-    estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
-    plain = inverse_of_block(square, estimated)
-    # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
-    depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
-    scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
-    # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
-    prior = np.diag(problem.prior_precision)
-    groups = coarsest_groups([trial_data.trial for trial_data in predictor.data])
-    fitted = estimated_unknowns(solution, plain)
-    meats = [group_scatter(scores, each, fitted) + prior for each in (range(len(scores)), groups)]
-    robust, by_group = (plain @ meat @ plain for meat in meats)
-    np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    return plain, robust
-
-
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
     """The clusters of trials whose errors may be correlated: specimens, else days, else single trials."""
     for column in GROUPINGS:
@@ -650,14 +461,30 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
     return [str(i) for i in range(len(trials))]  # Not their names: a planned trial may be there several times
 
 
-def group_scatter(single: Floats, groups: Sequence[Hashable], fitted: float) -> Floats:
-    """Variance of the sum of scores from the scatter of sums over groups, corrected for few groups. The correction is
-    G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015). Shapes: single
-    (n_trials, n_free) → (n_free, n_free).
-    """
+def _summed_over(groups: Sequence[Hashable], single: Floats) -> Floats:
+    """Sums over the trials of each group. Shapes: single (n_trials, …) → (n_groups, …)."""
     of_trial = np.unique(np.asarray(groups), return_inverse=True)[1]
-    count, trials = of_trial.max() + 1, len(single)
-    sums = np.zeros((count, single.shape[1]))
+    sums = np.zeros((of_trial.max(initial=-1) + 1, *single.shape[1:]))
     np.add.at(sums, of_trial, single)
-    factor = count / max(count - 1, 1) * (trials - 1) / max(trials - fitted, 1)
-    return np.asarray(sums.T @ sums * factor)
+    return sums
+
+
+def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floats:
+    """Variance of sums over trials, from the scatter of single trials or, where that is larger, of their clusters
+    (`coarsest_groups`); 0 where trials are too few. Shapes: single (n_trials, n) → (n,).
+    """
+    trials = len(single)
+    if trials < FEWEST_CLUSTERS:
+        return np.zeros(single.shape[1])
+    single = single - single.mean(axis=0)
+    return np.max([group_scatter(single, each, fitted) for each in (range(trials), groups)], axis=0)
+
+
+def group_scatter(single: Floats, groups: Sequence[Hashable], fitted: float) -> Floats:
+    """Variance of sums over trials from the scatter of those over groups, corrected for few groups by
+    G/(G − 1) · (N − 1)/(N − p): CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015). Shapes: single
+    (n_trials, n) → (n,).
+    """
+    sums, trials = _summed_over(groups, single), len(single)
+    factor = len(sums) / max(len(sums) - 1, 1) * (trials - 1) / max(trials - fitted, 1)
+    return np.asarray(np.sum(sums**2, axis=0) * factor)

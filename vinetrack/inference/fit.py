@@ -26,7 +26,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
-from vinetrack.inference.errors import Pooled, pool, student, trial_information
+from vinetrack.inference.errors import student, trial_information
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import at_correlation, whiten
@@ -71,14 +71,14 @@ if TYPE_CHECKING:
 #
 # With release and origin of the trial fitted to it, the deviation from the prediction is
 #
-#     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
+#     e = M (X δθ + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 #
-# δθ is the error of the shared parameters, u the difference of the trial's parameters from those
-# (`errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
-# position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of the model along each
-# trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal of
+# δθ is the error of the shared parameters, d the trial's deviations of pressure and B, s errors that replicates do not
+# show (smooth errors of position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of
+# the model along each trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal
+# of
 #
-#     M (X Cov(δθ + u) Xᵀ + Z Cov(d) Zᵀ + S Sᵀ + K) Mᵀ + δ² ℓ²
+#     M (X Cov(δθ) Xᵀ + Z Cov(d) Zᵀ + S Sᵀ + K) Mᵀ + δ² ℓ²
 #
 # with ℓ the travel of the trial. δ is the discrepancy of the model between trials (Kennedy & O'Hagan, J. R. Stat. Soc.
 # B 63, 425, 2001), one standard deviation along the whole motion. It is chosen so that the trials of the fit, each left
@@ -101,12 +101,11 @@ class Calibration(NamedTuple):
 
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
     """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
-    basis = _pooled_basis(fit)
-    calibration = _calibrated(fit, basis)
+    calibration = _calibrated(fit)
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
-            loadings, random = _loadings_of_new_trial(fit, basis, trial_data, trial)
+            loadings, random = _loadings_of_new_trial(fit, trial_data, trial)
         except SimulationError:
             banded.append(trial)
             continue
@@ -129,19 +128,11 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
     return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 
-def _pooled_basis(fit: Fit) -> Pooled:
-    """The fit as predictions use it, with trials that disagree weighted by it."""
-    disagree = fit.between is not None and fit.between.any()
-    pooled = pool(fit.predictor, fit.solution, len(fit.numbers)) if disagree else None
-    return pooled or Pooled(
-        fit.solution, *trial_information(fit.solution), fit.covariance, np.zeros_like(fit.covariance)
-    )
-
-
-def _calibrated(fit: Fit, basis: Pooled) -> Calibration:
+def _calibrated(fit: Fit) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
-    solution, data = basis.solution, fit.predictor.data
-    pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
+    solution, data = fit.solution, fit.predictor.data
+    known = trial_information(solution)
+    pairs = [_leave_one_out(solution, *known, data[i], i, fit.noise_correlation) for i in range(len(data))]
     predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not predictable:
         # 1.96: derived: standard normal quantile of 0.975
@@ -150,9 +141,9 @@ def _calibrated(fit: Fit, basis: Pooled) -> Calibration:
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
     delta2 = _paule_mandel(square, mean_variance, travel2)
-    assumed = delta2 == 0.0 and not basis.between.any() and not any(solution.estimable)
-    # Restricted likelihood loses a degree of freedom for each fitted parameter; δ and τ lose one.
-    fitted = 1 if delta2 > 0 or basis.between.any() else int(np.count_nonzero(solution.problem.prior_precision == 0))
+    assumed = delta2 == 0.0 and not any(solution.estimable)
+    # Restricted likelihood loses a degree of freedom for each fitted parameter; δ loses one.
+    fitted = 1 if delta2 > 0 else int(np.count_nonzero(solution.problem.prior_precision == 0))
     degrees = math.inf if assumed else max(float(len(predictable) - fitted), 1.0)
     reaches = np.sort(
         [
@@ -176,30 +167,31 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _leave_one_out(basis: Pooled, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
+def _leave_one_out(
+    solution: Solution, information: Floats, scores: Floats, trial_data: FitTrial, i: int, fit_correlation: float
+) -> tuple[Floats, Floats] | None:
     """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
     trials do not determine all parameters on which it depends.
     """
-    solution = basis.solution
     problem, state = solution.problem, solution.state
     size = problem.prior_mean.size
-    total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
-    others = total - basis.information[i]
+    total = information.sum(axis=0) + np.diag(problem.prior_precision)
+    others = total - information[i]
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    needed = free[np.diag(basis.information[i])[free] > 0]
+    needed = free[np.diag(information[i])[free] > 0]
     # 1e-6: part of the information on a parameter that must come from other trials to predict a trial from them
     # (chosen)
-    if len(basis.scores) < 2 or (np.diag(others)[needed] <= 1e-6 * np.diag(total)[needed]).any():
+    if len(scores) < 2 or (np.diag(others)[needed] <= 1e-6 * np.diag(total)[needed]).any():
         return None
     covariance = inverse_of_block(others, free)
     columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
     design = _design_matrix(columns, problem.index[i], size)
-    shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
+    shift = covariance @ (scores[i] - scores.mean(axis=0))
     residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
     own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
     own_loadings = _deviation_loadings(own_sd, columns, trial_data)
-    loadings = np.column_stack([design @ matrix_root(covariance + basis.between), own_loadings])
+    loadings = np.column_stack([design @ matrix_root(covariance), own_loadings])
     noise = float(state.variance[i]) / (1 - state.rho**2)
     aligned, random, residual = _with_release_and_origin_fitted(
         loadings, residual, columns[:, :2], trial_data, fit_correlation, state, noise
@@ -222,7 +214,7 @@ def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -
     return np.asarray(moved * [spread[0], spread[1], misset])
 
 
-def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+def _loadings_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """Displacement of a new trial by one standard deviation of each error, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
     theta, places = values_for_trial(fit, layout, trial_data)
@@ -231,8 +223,7 @@ def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial:
     columns = predictor.linearise(theta, trial_effects)[0]
     held = zip(fit.predictor.layout.free, fit.numbers, strict=True)
     slopes = np.array([free.derivative(number.value) for free, number in held])
-    known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) / slopes[:, None] / slopes
-    covariance = known + basis.between[: len(fit.numbers), : len(fit.numbers)]
+    covariance = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) / slopes[:, None] / slopes
     parameter_covariance = np.diag(
         np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0)
     )
@@ -240,7 +231,7 @@ def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial:
     parameter_covariance[matched, :] = parameter_covariance[:, matched] = 0.0
     parameter_covariance[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
     design = _design_matrix(columns, layout.index[0], theta.size)
-    state = basis.solution.state
+    state = fit.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]
     shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]

@@ -489,7 +489,6 @@ class Fit(NumberTable):
     solution: Solution
     options: Mapping[str, Any]
     pairs: tuple[tuple[Trial, Track], ...] = ()
-    between: Floats | None = None
     with_errors: FitState | None = None
 
     @property

@@ -19,7 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
-from vinetrack.inference.errors import robust_covariance, trial_information, with_systematics
+from vinetrack.inference.errors import robust_variances, trial_information, with_systematics
 from vinetrack.inference.fit_result import (
     BetweenTrialSpread,
     Fit,
@@ -66,7 +66,7 @@ def film_influence(fit: Fit) -> Floats:
         return np.zeros(len(fit.numbers))
     errors = systematics_of(fit.predictor, fit.solution, ["film"])
     solution = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
-    plain = robust_covariance(fit.predictor, solution)[0]
+    plain = robust_variances(fit.predictor, solution)[0]
     products = fit.predictor.products(errors.beside(solution.columns))
     both = replace(solution, problem=errors.among(solution.problem), cross_products=products)
     moved = (plain @ trial_information(both)[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
@@ -107,7 +107,6 @@ class FitSummary(NumberTable, JsonRecord):
     ] = ""
     numbers: tuple[Number, ...] = ()
     covariance: Stored = field(default_factory=lambda: np.empty((0, 0)))
-    between: Annotated[Stored, Field(alias="between_trials")] = field(default_factory=lambda: np.empty((0, 0)))
     moved_by_film: Stored = field(default_factory=lambda: np.empty(0))
     spreads: Mapping[str, BetweenTrialSpread] = field(default_factory=dict)
     noise_m: OrNaN = math.nan
@@ -157,7 +156,6 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         names=tuple(fit.model.names),
         numbers=fit.numbers,
         covariance=fit.covariance,
-        between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
         moved_by_film=moved,
         spreads=fit.spreads,
         noise_m=fit.noise_m,

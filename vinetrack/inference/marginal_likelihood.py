@@ -142,7 +142,6 @@ def noise_at_correlations(
     points: Floats,
     rhos: Floats,
     shared: float,
-    least_residual_part: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Restricted likelihood and residual sums of squares of all trials at each noise correlation, trial effects fitted.
     Returns scores (−2 ln of the restricted likelihood, profiled over the variances, without the term of the gaps),
@@ -159,7 +158,8 @@ def noise_at_correlations(
     log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
     dof = np.maximum(points - shared - m + np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1), 1.0)
     explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
-    squares = np.maximum(residual - explained, least_residual_part * residual)
+    # 0.2: least part of the residual sum of squares that remains (chosen)
+    squares = np.maximum(residual - explained, 0.2 * residual)
     return np.sum(dof * np.log(squares / dof) + log_det, axis=1), squares, dof
 
 
@@ -523,7 +523,7 @@ def matrix_root(square: Floats) -> Floats:
 
 
 def estimate_noise(
-    cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
+    cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None
 ) -> tuple[float, Floats]:
     """Noise correlation, the same for all trials, and innovation variance of each trial, by restricted likelihood. The
     residuals are those after the trial effects have been fitted. Each variance is shrunk towards the common one by as
@@ -534,29 +534,19 @@ def estimate_noise(
     centre, precision = trial_effect_prior(problem, state)
     precision_scaled = precision * state.variance[:, None]
     prior_gradient = precision_scaled * (state.trial_effects - centre)
-    n_freed = N_TRIAL_EFFECTS + problem.index.shape[1] if within else N_TRIAL_EFFECTS
-    shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
-    if within:
-        information = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:n_freed]
-        # 1e-9: part of a trial's information at white noise that leaves the shared parameters free in it (derived)
-        vague = np.where(information > 0, 1e-9 * information, 1.0)
-        precision_scaled = np.concatenate([precision_scaled, vague], axis=1)
-        prior_gradient = np.pad(prior_gradient, ((0, 0), (0, n_freed - N_TRIAL_EFFECTS)))
-    columns = [*range(n_freed), cross_products.shape[-1] - 1]
-    # 1e-6, 0.2: least part of the residual sum of squares that remains (derived)
+    columns = [*range(N_TRIAL_EFFECTS), cross_products.shape[-1] - 1]
     scores, squares, degrees = noise_at_correlations(
         cross_products[:, :, columns][:, :, :, columns],
         precision_scaled,
         prior_gradient,
         problem.points,
         grid,
-        shared,
-        1e-6 if within else 0.2,
+        np.count_nonzero(problem.free) / problem.index.shape[0],
     )
     scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(cross_products, problem, state, _parabola_minimum(grid, scores, best), within=within)
+        return estimate_noise(cross_products, problem, state, _parabola_minimum(grid, scores, best))
     return rho, _shrink_to_common(squares[0], degrees[0])
 
 

@@ -15,15 +15,12 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.errors import (
-    Pooled,
     Precision,
     WithSystematics,
     near_bound,
-    pool,
     precision,
     profile_interval,
     student,
-    too_few_clusters,
     widened_covariance,
     with_systematics,
 )
@@ -149,12 +146,9 @@ def fit_messages(
     solution: Solution,
     numbers: Sequence[Number],
     precision: Precision,
-    between: Floats,
     chi2: float,
 ) -> tuple[Remark, ...]:
-    """Warnings on convergence, on each number, on the size of the residuals and on trials that disagree; notes on the
-    data. Shapes: between (n_numbers, n_numbers).
-    """
+    """Warnings on convergence, on each number and on the size of the residuals; notes on the data."""
     told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
     for k, number in enumerate(numbers):
         named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
@@ -191,16 +185,6 @@ def fit_messages(
             largest = max(number.shared, key=lambda source: number.shared[source])
             by_source.setdefault(largest, []).append(number.title)
     told += [remark("mostly_shared", names=titles, source=source) for source, titles in by_source.items()]
-    sd = np.sqrt(np.diag(between))
-    # 1.0: standard deviation between trials, in errors of the shared number, from which the fit says that trials
-    # disagree
-    differing = [
-        (n.title, float(sd[k]), n.unit)
-        for k, n in enumerate(numbers)
-        if sd[k] > 1.0 * n.sigma and math.isfinite(n.sigma)
-    ]
-    if differing:
-        told.append(remark("trials_disagree", differences=differing))
     return (*told, *_notes_on_data(predictor.data))
 
 
@@ -233,20 +217,10 @@ def assemble(
     extended = with_errors.solution
     by_noise = precision(extended)
     trials = _trial_fits(predictor, solution, by_noise.first(len(layout.free)))
-    pooled = _pooled_if_few(predictor, solution, options)
-    if pooled is not None:
-        unknown = np.diag(~np.isfinite(np.diag(by_noise.covariance)))
-        extended, by_noise = (
-            pooled.solution,
-            replace(by_noise, covariance=np.where(unknown, math.inf, pooled.covariance)),
-        )
     trials = _with_errors_removed(trials, with_errors)
-    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources, pooled)
+    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources)
     precision_of_fit = precision_of_fit.first(len(layout.free))
     numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
-    count = len(numbers)
-    between = np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
-    between = _in_SI_units(layout, numbers, between)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
     variance_state = with_errors.solution.state
@@ -272,14 +246,13 @@ def assemble(
         chi2_per_dof=chi2,
         log_likelihood=solution.log_likelihood() + with_errors.gain,
         trials=trials,
-        messages=fit_messages(predictor, solution, numbers, precision_of_fit, between, chi2),
+        messages=fit_messages(predictor, solution, numbers, precision_of_fit, chi2),
         left_out=dict(left_out),
         converged=solution.converged,
         iterations=solution.iterations,
         predictor=predictor,
         solution=solution,
         options=options,
-        between=between,
         with_errors=variance_state,
     )
 
@@ -299,18 +272,6 @@ def _with_errors_removed(trials: Sequence[TrialFit], with_errors: WithSystematic
         )
         for trial, white, values in zip(trials, with_errors.whitened, effects, strict=True)
     )
-
-
-def _pooled_if_few(predictor: Predictor, solution: Solution, options: Mapping[str, Any]) -> Pooled | None:
-    """The fit with trials weighted by their disagreement, where the fit itself has no term for it. That is where trials
-    are few, or have neither B nor pressure, which are what trials of a vine may differ by.
-    """
-    held = options.get("held")
-    if held is not None and held.noise is not None:
-        return None
-    if too_few_clusters(predictor, solution) or not solution.problem.has_deviation.any():
-        return pool(predictor, solution, len(predictor.layout.free))
-    return None
 
 
 def _numbers(

@@ -273,12 +273,10 @@ class FitNumbers:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Covariance of the parameters of a new trial, between-trial differences included, of ln B in place of B; 0
-        where the fit does not determine one. It is widened where the 95 % interval is wider than a normal one's.
+        """Covariance of the parameters, of ln B in place of B; 0 where the fit does not determine one. It is widened
+        where the 95 % interval is wider than a normal one's.
         """
         covariance = self.fit.covariance
-        if self.fit.between is not None and self.fit.between.shape == covariance.shape:
-            covariance = covariance + np.nan_to_num(self.fit.between)
         scale = np.zeros(len(self.fit.numbers))
         for k, fitted in enumerate(self.fit.numbers):
             if math.isfinite(self.fit.covariance[k, k]):
