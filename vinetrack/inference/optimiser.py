@@ -18,6 +18,8 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import (
+    CORRELATIONS,
+    LARGEST_SPREAD,
     FitState,
     MixedProblem,
     deviance,
@@ -261,6 +263,8 @@ def solve(
         state = update_variances(
             predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
         )
+        if state.rho == CORRELATIONS[-1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
+            break  # Noise and differences between trials have taken up what the model lacks.
         variances_moved = variance_change(before, state)
         damping_before = damping
         (step, effect_step, predicted_decrease), damping = _next_step(
