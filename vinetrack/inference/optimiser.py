@@ -240,13 +240,10 @@ def solve(
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
     Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
     """
-    # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
-    first_iterations, most_first_iterations, far_from_optimum = 3, 9, 1e3
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
     state = _with_fixed_terms(state, fixed_terms)
     damping, converged, iteration, predicted_decrease = (0.0 if warm else 1e-3), False, 0, math.inf
-    first_phase = not warm
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )
@@ -256,13 +253,9 @@ def solve(
     searches_left, last_search, searched_in_vain = 8, 0, False
     releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
-        close = predicted_decrease < far_from_optimum or iteration > most_first_iterations
-        first_phase = first_phase and not (iteration > first_iterations and close)
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
-        state = update_variances(
-            predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
-        )
+        state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms)
         if state.rho == CORRELATIONS[-1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
             break  # Noise and differences between trials have taken up what the model lacks.
         variances_moved = variance_change(before, state)
@@ -287,7 +280,7 @@ def solve(
                 searches_left, searched_in_vain = searches_left - 1, False
                 continue
             searches_left = 0 if small_step else searches_left
-        if small_step and variances_moved < CONVERGED_VARIANCES and not first_phase:
+        if small_step and variances_moved < CONVERGED_VARIANCES:
             converged = True
             break
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
@@ -299,7 +292,7 @@ def solve(
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
             # step should gain much, it is no minimum, but nothing more can be done.
             if variances_moved < CONVERGED_VARIANCES:
-                converged = predicted_decrease < far_from_optimum
+                converged = predicted_decrease < 1e3  # of −2 ln L (chosen)
                 break
             continue
         try:
@@ -348,14 +341,12 @@ def update_variances(
     state: FitState,
     estimable_sd: tuple[bool, bool],
     fixed_terms: FixedTerms,
-    *,
-    first_phase: bool = False,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations; in the first phase only the size of the noise."""
+    """Estimate noise and between-trial standard deviations."""
     if fixed_terms.noise is None:
-        rho, variance = estimate_noise(cross_products, problem, state, state.rho if first_phase else None)
+        rho, variance = estimate_noise(cross_products, problem, state)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if not first_phase and any(estimable_sd):
+    if any(estimable_sd):
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
         state = replace(state, spread=spread)
     return state
