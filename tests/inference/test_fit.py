@@ -454,7 +454,7 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion,
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     own = solution.state.trial_effects.copy()
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
-    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms(), warm=True)
+    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
     found = vt.refit(replace(only_in_motion, solution=elsewhere))
     assert found.solution.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
     assert np.isfinite(found["n"].sigma)

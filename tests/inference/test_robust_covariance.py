@@ -216,5 +216,5 @@ def test_a_fit_that_no_step_improves_far_from_its_optimum_has_not_converged(monk
     fit = fitted()
     start = replace(fit.solution.state, theta=fit.solution.state.theta + 0.5)
     monkeypatch.setattr(optimiser, "_accepted_step", lambda *_, **__: (None, 0.0))
-    assert not solve(fit.predictor, fit.solution.problem, start, warm=True).converged
-    assert solve(fit.predictor, fit.solution.problem, fit.solution.state, warm=True).converged
+    assert not solve(fit.predictor, fit.solution.problem, start).converged
+    assert solve(fit.predictor, fit.solution.problem, fit.solution.state).converged

@@ -369,8 +369,8 @@ def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
     try:
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
-        solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
-        solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
+        solution = solve(predictor, problem, state, fixed, most_iterations=most)
+        solution = solve(predictor, problem, solution.state, most_iterations=most)
         # These absorb part of what is wrong in a hypothesis, as in every fit.
         gain = with_systematics(predictor, solution).gain
     except SimulationError:

@@ -120,7 +120,7 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
     how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2}
-    return at_solution(start, predictor, solve(predictor, start.solution.problem, state, held, warm=True, **how))
+    return at_solution(start, predictor, solve(predictor, start.solution.problem, state, held, **how))
 
 
 def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> FitTrial:

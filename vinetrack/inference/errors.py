@@ -226,9 +226,7 @@ def _deviance_increase(
     theta[place] = value
     problem = replace(solution.problem, free=free)
     try:
-        constrained = solve(
-            predictor, problem, replace(solution.state, theta=theta), held, warm=True, most_iterations=8
-        )
+        constrained = solve(predictor, problem, replace(solution.state, theta=theta), held, most_iterations=8)
     except SimulationError:
         return 1e6
     return constrained.deviance(restricted=False) - best

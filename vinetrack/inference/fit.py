@@ -328,7 +328,7 @@ def fit_subset(
         (state.rho, state.variance) if hold_noise else fixed_terms.noise,
     )
     try:
-        solution = solve(predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations)
+        solution = solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
     return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
@@ -391,7 +391,7 @@ def _aligned(
         # 1e-5, 20: decrease, as a part of the misfit, at which a prediction is aligned, and most steps (chosen)
         least = max(1e-5 * cost(undeviating, problem, state), CONVERGED_DECREASE)
         held = FixedTerms(noise=(rho, state.variance))
-        solution = solve(undeviating, problem, state, held, warm=True, most_iterations=20, least_decrease=least)
+        solution = solve(undeviating, problem, state, held, most_iterations=20, least_decrease=least)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     square = at_correlation(solution.cross_products, rho)[:, :2, :2]

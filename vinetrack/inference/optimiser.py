@@ -230,7 +230,6 @@ def solve(
     state: FitState,
     fixed_terms: FixedTerms | None = None,
     *,
-    warm: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
@@ -243,7 +242,7 @@ def solve(
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
     state = _with_fixed_terms(state, fixed_terms)
-    damping, converged, iteration, predicted_decrease = (0.0 if warm else 1e-3), False, 0, math.inf
+    damping, converged, iteration, predicted_decrease = 0.0, False, 0, math.inf
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )

@@ -106,7 +106,7 @@ def _solve_or_alike(
         alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
         if is_poor_fit(predictor, alike):
             return alike
-        return solve(predictor, problem, alike.state, fixed_terms, **{**how, "warm": True})
+        return solve(predictor, problem, alike.state, fixed_terms, **how)
     except SimulationError:
         return solution
 
@@ -130,8 +130,8 @@ def solve_onward(
         state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
         noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
         # 40: steps at fixed noise, at most (chosen)
-        state = solve(predictor, problem, state, noise, warm=True, most_iterations=40).state
-    return _solve_or_alike(predictor, problem, state, fixed_terms, warm=True, **how)
+        state = solve(predictor, problem, state, noise, most_iterations=40).state
+    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
 
 
 # ------------------------------------------------------------------------------
