@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,19 +89,9 @@ if TYPE_CHECKING:
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
 
-class Calibration(NamedTuple):
-    """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel; the
-    half width of the band in standard deviations; Student's degrees of freedom.
-    """
-
-    discrepancy: float
-    reach: float
-    degrees: float
-
-
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
     """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
-    calibration = _calibrated(fit)
+    discrepancy, reach = _calibrated(fit)
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
@@ -109,34 +99,22 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
         except SimulationError:
             banded.append(trial)
             continue
-        discrepancy_variance = (calibration.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
-        sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + discrepancy_variance)
-        reach = max(calibration.reach, _simultaneous(loadings / sigma[:, None], calibration.degrees))
-        banded.append(replace(trial, band_m=reach * sigma))
+        variance = np.sum(loadings**2, axis=1) + random + (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
+        banded.append(replace(trial, band_m=reach * np.sqrt(variance)))
     return banded
 
 
-def _simultaneous(loadings: Floats, degrees: float) -> float:
-    """Standard deviations within which COVERED_POSITIONS of the positions of COVERAGE of trials lie. For a single way
-    to deviate that is Student's t; for several, more, since a trial may deviate by one early and by another late.
+def _calibrated(fit: Fit) -> tuple[float, float]:
+    """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel, and
+    the half width of the band in standard deviations.
     """
-    draws = 1000  # Curves drawn for a simultaneous band (chosen)
-    draw = np.random.default_rng(1)
-    scale = np.ones(draws) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, draws))
-    thinned = loadings[:: max(len(loadings) // 60, 1)]
-    curves = np.abs(thinned @ draw.standard_normal((loadings.shape[1], draws))) * scale
-    return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
-
-
-def _calibrated(fit: Fit) -> Calibration:
-    """The discrepancy between trials and its degrees of freedom."""
     solution, data = fit.solution, fit.predictor.data
     known = trial_information(solution)
     pairs = [_leave_one_out(solution, *known, data[i], i, fit.noise_correlation) for i in range(len(data))]
     predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not predictable:
         # 1.96: derived: standard normal quantile of 0.975
-        return Calibration(0.0, 1.96, math.inf)
+        return 0.0, 1.96
     square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
@@ -153,7 +131,7 @@ def _calibrated(fit: Fit) -> Calibration:
     )
     enough = min(math.ceil(COVERAGE * (len(predictable) + 1)), len(predictable))
     reach = max(float(student(np.array([degrees]))[0]), float(reaches[enough - 1]))
-    return Calibration(math.sqrt(delta2), reach, degrees)
+    return math.sqrt(delta2), reach
 
 
 def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
