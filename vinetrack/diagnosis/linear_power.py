@@ -24,7 +24,7 @@ from scipy.stats import norm, t
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SINGLE_PROBE_LEVEL, MisfitTests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
@@ -397,8 +397,7 @@ def _false_alarms(fit: Fit) -> dict[str, float]:
     level = FALSE_ALARM_LEVEL_FIRST_ROUND
     rates = {
         "scores of all candidates": level,
-        "any smooth force": 0.1 * level,
-        "the loudest probe": min(SINGLE_PROBE_LEVEL, level),
+        "any smooth force": min(PROBE_LEVEL, level),
         "replicates that err alike": 0.1 * level,
     }
     trials = [trial.trial for trial in fit.trials]

@@ -1,8 +1,8 @@
 """Tests of one fitted model: is anything missing, and which effect would explain it. No model is refitted.
 
 A model is rejected by any of three kinds of test. Score tests are made of each candidate (`score_test`, with
-family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces
-(`structure_of`), and a test of the trial effects (`between_conditions_p`). The last compares the misfit with the noise
+family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces, and a
+test of the trial effects (`between_conditions_p`). The last compares the misfit with the noise
 and the slow errors of the tracks.
 """
 
@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +31,6 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
-from vinetrack.inference.errors import FEWEST_CLUSTERS, cluster_variance
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit, relative_residual
 from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
@@ -40,8 +38,7 @@ from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
 #
-# Probes are bumps of force along the growth, over speed and over time. Where too few trials tell how far trials
-# differ, scores have the variance of the noise model, known from each spare trial once for every bump along its growth.
+# Probes are bumps of force along the growth, over speed and over time, tested like the shapes of one more candidate.
 
 
 def _probe_shapes(fit: Fit) -> list[CandidateShape]:
@@ -66,56 +63,11 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     return shapes
 
 
-class Structure(NamedTuple):
-    """p-values of the probes: of all scores together, and the smallest of single probes, Bonferroni-corrected: a narrow
-    feature shows in one probe and is diluted in the sum over all.
-    """
-
-    p: float = 1.0
-    smallest_probe_p: float = 1.0
-
-
-def structure_of(fit: Fit, systematics: Systematics) -> Structure:
-    """Test a fit for misfit that a smooth force could explain. The scores of all probes are tested together, with both
-    kinds of error, in the directions that the fitted parameters leave to them.
-    """
-    answers = effect_sensitivities(fit, _probe_shapes(fit))
-    if not answers.shapes:
-        return Structure()
-    return structure_from_scores(scores_of(fit, products_of(fit, answers, systematics)))
-
-
-def structure_from_scores(scores: Scores) -> Structure:
-    """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`."""
-    from scipy.stats import f as fisher
-    from scipy.stats import t
-
-    root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
-    informative = np.diag(scores.information) > 0
-    information = (scores.information / root[:, None] / root)[np.ix_(informative, informative)]
-    score = (scores.score / root)[informative]
-    values, vectors = np.linalg.eigh(information)
-    # 1e-4: smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of
-    # freedom (chosen)
-    keep = values > 1e-4 * values.max(initial=0.0)
-    # In the principal directions the scores are uncorrelated and have variance 1 by the noise model.
-    z = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
-    directions = (vectors / root[informative][:, None])[:, keep] / np.sqrt(values[keep])
-    trial_z = scores.trial_scores[:, informative] @ directions
-    trial_informations = scores.trial_informations[:, informative][:, :, informative]
-    explained = np.einsum("jk,njl,lk->nk", directions, trial_informations, directions) * z
-    robust = cluster_variance(trial_z - explained, scores.fitted, scores.groups)
-    chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
-    degrees = int(np.count_nonzero(keep))
-    few, noise_degrees = len(trial_z) < FEWEST_CLUSTERS, 8 * scores.degrees  # 8: bumps along the growth
-    p = float(fisher.sf(chi2 / degrees, degrees, noise_degrees if few else scores.degrees)) if degrees else 1.0
-    # A probe to which few trials respond has as few degrees of freedom (effective number of trials).
-    by_trial = np.einsum("njj->nj", scores.trial_informations)[:, informative]
-    n_effective = by_trial.sum(axis=0) ** 2 / np.maximum(np.sum(by_trial**2, axis=0), 1e-300)
-    probe_degrees = noise_degrees if few else np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0))
-    p_values = 2 * t.sf(np.abs(scores.z[informative]), probe_degrees)
-    smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
-    return Structure(p, smallest_probe_p)
+def any_probe_exceeds(scores: Scores, level: float) -> bool:
+    """Whether the score of some probe exceeds the threshold of so many bumps, of either sign."""
+    signs, names = [0] * scores.score.size, ["probe"] * scores.score.size
+    threshold = family_test(scores.cosines, signs, names, level).threshold("probe")
+    return bool(np.max(scores.one_sided(signs), initial=0.0) > threshold)
 
 
 # ------------------------------------------------------------------------------
@@ -198,7 +150,7 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 # Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
 
-SINGLE_PROBE_LEVEL = 3e-4  # Level of the test of the single most significant probe (chosen)
+PROBE_LEVEL = 3e-4  # Largest level of the test of all probes (chosen)
 
 # χ² per degree of freedom, against the noise of the tracks alone, from which a model is far off (chosen)
 FAR_OFF_CHI2_PER_DOF = 4.0
@@ -233,25 +185,13 @@ class MisfitTests:
     sensitivities: EffectSensitivities
     products: Products
     scores: Scores
-    structure: Structure
     level: float
+    film: bool = False
 
     @cached_property
     def one_sided_z(self) -> Floats:
-        """Score of every shape in standard errors (z) where its sign is allowed; 0 where it is not. The smaller of two:
-        by the noise model, and by the scatter of single trials, whose Student's t is converted to the normal quantile
-        of the same tail probability.
-        """
-        from scipy.stats import norm, t
-
-        size, signs = self.scores.size, np.array(self.signs)
-        allowed_size = np.where(signs == 0, np.abs(size), np.maximum(size * signs, 0.0))
-        plain, robust = self.scores.plain_sigma, self.scores.robust_sigma
-        z = allowed_size / plain
-        with np.errstate(divide="ignore", invalid="ignore"):
-            robust_t = np.where(robust > 0, allowed_size / robust, np.inf)
-        log_tail = t.logsf(np.minimum(robust_t, 1e6), max(self.scores.degrees, 3.0))
-        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(log_tail, -700.0)))))
+        """Score of every shape in standard errors, see `Scores.one_sided`."""
+        return self.scores.one_sided(self.signs)
 
     @property
     def signs(self) -> list[int]:
@@ -271,12 +211,12 @@ class MisfitTests:
     @property
     def rejects_model(self) -> bool:
         """Whether any test rejects the model: something is missing, in the catalogue or not."""
-        return bool(self.exceeds_slow_errors or self.omnibus_rejects or self.largest_excess(self.family) > 0)
+        return bool(self.exceeds_slow_errors or self.largest_excess(self.family) > 0 or self.omnibus_rejects)
 
     @property
     def omnibus_rejects(self) -> bool:
         """Whether a test that names no candidate rejects: probe forces, or trial effects."""
-        return self.probes_reject or self.trial_effect_p < 0.1 * self.level
+        return self.trial_effect_p < 0.1 * self.level or self.probes_reject
 
     @cached_property
     def trial_effect_p(self) -> float:
@@ -295,11 +235,14 @@ class MisfitTests:
         family = family_test(self.scores.cosines, self.signs, self.sensitivities.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
         return self.largest_excess(family) > 0
 
-    @property
+    @cached_property
     def probes_reject(self) -> bool:
-        """Whether a smooth force would improve the fit: all probes together, or the most significant one."""
-        all_probes = self.structure.p < 0.1 * self.level
-        return all_probes or self.structure.smallest_probe_p < min(SINGLE_PROBE_LEVEL, self.level)
+        """Whether a smooth force would improve the fit."""
+        answers = effect_sensitivities(self.fit, _probe_shapes(self.fit))
+        if not answers.shapes:
+            return False
+        scores = scores_of(self.fit, products_of(self.fit, answers, _systematics(self.fit, self.film)))
+        return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
 
     @property
     def exceeds_slow_errors(self) -> bool:
@@ -399,7 +342,9 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     trials = [trial.trial for trial in fit.trials]
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
-    systematics = systematics_of(fit.predictor, fit.solution, [*SOURCES, "film"] if film else SOURCES)
-    products = products_of(fit, sensitivities, systematics)
-    structure = structure_of(fit, systematics)
-    return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), structure, level)
+    products = products_of(fit, sensitivities, _systematics(fit, film))
+    return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), level, film)
+
+
+def _systematics(fit: Fit, film: bool) -> Systematics:
+    return systematics_of(fit.predictor, fit.solution, [*SOURCES, "film"] if film else SOURCES)

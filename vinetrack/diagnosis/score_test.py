@@ -425,10 +425,20 @@ class Scores:
         scatter = np.sqrt(cluster_variance(residual, self.fitted, self.groups))
         return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
 
-    @property
-    def z(self) -> Floats:
-        """Sizes in standard errors."""
-        return self.size / self.sigma
+    def one_sided(self, signs: Sequence[int]) -> Floats:
+        """Score of every shape in standard errors (z) where its sign, 0 for either, is allowed; 0 where it is not. The
+        smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to the
+        normal quantile of the same tail probability.
+        """
+        from scipy.stats import norm, t
+
+        size, sign = self.size, np.array(signs)
+        allowed_size = np.where(sign == 0, np.abs(size), np.maximum(size * sign, 0.0))
+        z = allowed_size / self.plain_sigma
+        with np.errstate(divide="ignore", invalid="ignore"):
+            robust_t = np.where(self.robust_sigma > 0, allowed_size / self.robust_sigma, np.inf)
+        log_tail = t.logsf(np.minimum(robust_t, 1e6), max(self.degrees, 3.0))
+        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(log_tail, -700.0)))))
 
     @property
     def cosines(self) -> Floats:
