@@ -168,7 +168,8 @@ def diagnosed(folder: Path, effect: str, line: Line) -> Line:
     alarm = said.verdict != "adequate"
     held = next((candidate for candidate in said.ranking if candidate.effect == effect), None)
     # A simpler law that it holds as a limit, and that fits as well, is named in its place.
-    simpler = held is not None and any(held.is_richer_form_of(name) for name in said.answer_set)
+    why = held.reason if held is not None and held.reason.code in ("contains", "contains_and_fits_no_better") else None
+    simpler = why is not None and why.facts["name"] in said.answer_set
     return line | {
         "verdict": said.verdict,
         "answer": "|".join(said.answer_set),

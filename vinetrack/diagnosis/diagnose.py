@@ -5,7 +5,6 @@ diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -206,16 +205,14 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             single.effects[0],
             in_answer_set=in_answer_set,
             reason=rejected.get(name, single.reason),
-            largest=tests.upper_limits(effects[name])[0] if name in effects else {},
             along=single.others if in_answer_set else (),
             posterior_weight=weights[name],
             confounded_by=tuple(each for each in step.confounded if each.parameter.split(".")[0] == name),
-            log_bayes=single.log_bayes,
         )
         rows.append(row)
     for effect in (effect for name, effect in effects.items() if name not in singles):
         upper_limits, is_detectable = tests.upper_limits(effect)
-        z, shape = tests.best_z(effect.name)
+        z = tests.best_z(effect.name)
         if effect.name in tests.sensitivities.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
         elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
@@ -227,12 +224,11 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
                 effect.name,
                 effect.kind,
                 SCREENED,
-                _predicted_gain(step, effect.name, z),
+                z**2,
                 z,
-                tests.predicted_size(effect, shape),
                 in_answer_set=effect.name in step.answer_names,
                 reason=remark(CONTAINS, name=contained[0]) if contained else Remark(),
-                largest={} if tests.poorly_fitted else upper_limits,
+                largest=upper_limits if step.verdict == ADEQUATE else {},
             )
             rows.append(row)
     rows += [
@@ -241,15 +237,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         if name not in tests.fit.model
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
-    gain = {id(row): row.delta_chi2 if math.isfinite(row.delta_chi2) else -math.inf for row in rows}
-    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -gain[id(row)]))
-
-
-def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:
-    """Predicted fall of −2 ln L (linear); of an adequate model, the squared score."""
-    if step.verdict == ADEQUATE:
-        return z**2
-    return math.nan if step.tests.poorly_fitted else step.tests.predicted_gain(name)
+    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -np.nan_to_num(row.delta_chi2)))
 
 
 def _or_note(result: Diagnosis, code: str, found: Callable[[], Diagnosis]) -> Diagnosis:

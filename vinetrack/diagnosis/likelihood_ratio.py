@@ -277,14 +277,6 @@ class LikelihoodRatio:
         return "+".join(self.names)
 
     @property
-    def log_bayes(self) -> float:
-        """Logarithm of the Bayes factor against the fit without it, with the likelihood ratio reduced by `inflation`.
-        Shared parameters are at their maximum likelihood in both; those added are integrated over their priors, see
-        `vinetrack.diagnosis.likelihood_ratio`.
-        """
-        return 0.5 * self.delta_chi2 / self.inflation + self.log_evidence - self.fit.log_likelihood
-
-    @property
     def numbers(self) -> tuple[Number, ...]:
         """Fitted sizes of its effects, without those that no trajectory depends on."""
         return tuple(number for number in self.fit.numbers if self._adds(number) and math.isfinite(number.sigma))

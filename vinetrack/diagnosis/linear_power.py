@@ -191,7 +191,6 @@ def power_of(
     known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests), sizes_at_systematic_error(tests)
     asked = [effect for effect in tests.effects if only in ("", effect.name)]
     powers = [_effect_power(tests, effect, start, *known) for effect in asked]
-    far_off = tests.exceeds_slow_errors or tests.poorly_fitted
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,
@@ -201,7 +200,7 @@ def power_of(
         numbers=_interval_widths(tests.fit),
         inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
-        wary=remark("excess_counted_as_noise") if far_off else Remark(),
+        wary=remark("excess_counted_as_noise") if tests.exceeds_slow_errors else Remark(),
     )
 
 

@@ -31,8 +31,8 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
-from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, relative_residual
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import relative_residual
 from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 
 # ------------------------------------------------------------------------------
@@ -249,48 +249,33 @@ class MisfitTests:
         """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
         return exceeds_slow_errors(self.fit)
 
-    @property
-    def poorly_fitted(self) -> bool:
-        """Whether the model misses a visible part of the growth: linear predictions from this fit are meaningless."""
-        return is_poor_fit(self.fit.predictor, self.fit.solution)
-
     @cached_property
-    def predicted_gains(self) -> tuple[Floats, Floats]:
-        """Predicted fall of −2 ln L with each shape, and the size it is predicted at (linear)."""
+    def predicted_gains(self) -> Floats:
+        """Predicted fall of −2 ln L with each shape (linear); 0 where its sign is not allowed."""
         signs, size = np.array(self.signs), self.scores.size
-        sign_allowed = (signs == 0) | (size * signs > 0)
-        return np.where(sign_allowed, self.scores.score * size, 0.0), size
+        return np.where((signs == 0) | (size * signs > 0), self.scores.score * size, 0.0)
 
     def ranked_shapes(self, name: str) -> list[int]:
         """Indices of an effect's shapes, the largest predicted gain first."""
-        gains = self.predicted_gains[0]
-        return sorted(self._shapes_of(name), key=lambda i: -gains[i])
-
-    def _shapes_of(self, name: str) -> list[int]:
-        """Indices of an effect's shapes, in their order."""
-        return [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
+        indices = [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
+        return sorted(indices, key=lambda i: -self.predicted_gains[i])
 
     def predicted_gain(self, name: str) -> float:
         """Largest fall of −2 ln L that is predicted for any shape of an effect; 0 without shapes."""
-        indices = self.ranked_shapes(name)
-        return float(self.predicted_gains[0][indices[0]]) if indices else 0.0
+        return float(np.max(self.predicted_gains[self.ranked_shapes(name)], initial=0.0))
 
-    def best_z(self, name: str) -> tuple[float, int]:
-        """Largest z of an effect and the index of its shape; 0 and −1 where no trial responds to it.
-        Returns z, index.
-        """
-        indices = self._shapes_of(name)
-        if not indices:
-            return 0.0, -1
-        index = max(indices, key=lambda i: self.one_sided_z[i])
-        return float(self.one_sided_z[index]), index
+    def best_z(self, name: str) -> float:
+        """Largest z of an effect; 0 where no trial responds to it."""
+        return float(np.max(self.one_sided_z[self.ranked_shapes(name)], initial=0.0))
 
     def upper_limits(self, effect: Effect) -> tuple[dict[str, float], bool]:
         """Upper limit (one-sided 95 %) of an undetected size, and whether a plausible size would be detected at all.
         Returns limits (by `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable),
-        testable.
+        testable. Student's t counts where errors are those of the scatter of trials.
         """
-        indices = self._shapes_of(effect.name)
+        from scipy.stats import norm, t
+
+        indices = self.ranked_shapes(effect.name)
         if not indices or not effect.parameters:
             return {}, bool(indices)
         size, sigma = self.scores.size[indices], self.scores.sigma[indices]
@@ -300,40 +285,10 @@ class MisfitTests:
             return {}, False
         # The limit of the shape with the largest one holds whatever form the effect has.
         beyond = np.maximum(parameter.sign * size, 0.0) if parameter.sign else np.abs(size)
-        limits = beyond + self._quantiles(0.95)[indices] * sigma
+        by_scatter = (self.scores.robust_sigma > self.scores.plain_sigma)[indices]
+        limits = beyond + np.where(by_scatter, t.ppf(0.95, max(self.scores.degrees, 3.0)), norm.ppf(0.95)) * sigma
         sign = parameter.sign or math.copysign(1.0, size[np.argmax(limits)])
         return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}, True
-
-    def _quantiles(self, probability: float) -> Floats:
-        """Quantile of every size in standard errors: Student's t where these are those of the scatter of trials."""
-        from scipy.stats import norm, t
-
-        by_scatter = self.scores.robust_sigma > self.scores.plain_sigma
-        return np.where(by_scatter, t.ppf(probability, max(self.scores.degrees, 3.0)), norm.ppf(probability))
-
-    def predicted_size(self, effect: Effect, index: int) -> tuple[Number, ...]:
-        """One-step estimate of an effect's size with its standard error; empty where the model is too far off."""
-        if index < 0 or not effect.parameters or self.poorly_fitted:
-            return ()
-        size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
-        parameter = self.sensitivities.shapes[index].size
-        value, reach = parameter.zero + size, float(self._quantiles(0.975)[index]) * sigma
-        return (
-            Number(
-                key=f"{effect.name}.{parameter.name}",
-                vine=self.sensitivities.shapes[index].group,
-                symbol=parameter.symbol,
-                unit=parameter.unit,
-                value=value,
-                sigma=sigma,
-                low=value - reach,
-                high=value + reach,
-                dof=self.scores.degrees,
-                method="predicted",
-                lower=parameter.bounds[0],
-                upper=parameter.bounds[1],
-            ),
-        )
 
 
 def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: bool = False) -> MisfitTests:

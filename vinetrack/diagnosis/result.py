@@ -115,8 +115,8 @@ CONTAINS, CONTAINS_AND_FITS_NO_BETTER = "contains", "contains_and_fits_no_better
 
 @dataclass(frozen=True)
 class Candidate(JsonRecord):
-    """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L when it is added (predicted by
-    the linear model where only `screened`), and `sigma` its significance as a normal deviate, with one degree of
+    """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L when it is added (the
+    squared score where only `screened`), and `sigma` its significance as a normal deviate, with one degree of
     freedom for each size.
     """
 
@@ -133,11 +133,6 @@ class Candidate(JsonRecord):
     along: tuple[Number, ...] = ()
     posterior_weight: OrNaN = math.nan
     confounded_by: tuple[Confounder, ...] = ()
-    log_bayes: OrNaN = math.nan
-
-    def is_richer_form_of(self, name: str) -> bool:
-        """Whether it was set aside because it contains another effect as a limit."""
-        return self.reason.code in (CONTAINS, CONTAINS_AND_FITS_NO_BETTER) and self.reason.facts["name"] == name
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""

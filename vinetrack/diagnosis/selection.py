@@ -289,7 +289,7 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     """Find, for each size of the added effects, the physical effects that it may include. Returns for each size, those
     that could shift it by more than its standard error, the largest first.
     """
-    if after.poorly_fitted or not after.sensitivities.shapes:
+    if not after.sensitivities.shapes:
         return ()
     levers = levers_of(after.fit, after.products)
     chosen = []

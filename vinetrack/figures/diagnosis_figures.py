@@ -171,10 +171,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     """Rows with a finite gain or score and their roles: the answer set first, then by bar length; twelve at most."""
-    gain, score = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0)), np.abs(st.column(table, "sigma"))
-    # A predicted gain may have the wrong sign of the parameter or too small a noise; the score accounts for both.
-    fitted = (table["status"] == "refitted").to_numpy() & np.isfinite(gain)
-    height = np.where(fitted | ~np.isfinite(score), gain, score)
+    height = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0))
     answer = table["in_answer_set"].astype(bool)
     role = np.where(answer, "answer", np.where(table["kind"] == "measurement", "measurement", "physical"))
     known = table.assign(height=height, in_answer_set=answer, role=role)[np.isfinite(height)]

@@ -173,7 +173,6 @@ def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
     inside = [row for row in tested if row.in_answer_set]
     answer = ""
     if diagnosis.verdict == ADEQUATE and tested:
-        # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
         best = max(tested, key=lambda row: abs(row.sigma))
         answer = (
             f"{spaced_name(best.effect)}, the most significant of {len(tested)} candidates, reaches {_sigmas(best)} σ"
