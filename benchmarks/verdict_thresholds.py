@@ -43,7 +43,7 @@ THRESHOLDS = (
         "ANSWER_SET_DELTA_CHI2",
         "OUT_OF_REACH",
     ),
-    *("CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS", "RANGE_EDGE_DISTANCE", "PARTIAL_SHARE", "MIN_LINEAR_GAIN"),
+    *("CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS", "PARTIAL_SHARE", "MIN_LINEAR_GAIN"),
     *("SYSTEMATICS_CHECK_P_VALUE", "CONTRADICTING_DRIFT_SIGMAS", "FALSE_ALARM_LEVEL"),
 )
 """Numbers of `vinetrack.diagnosis` that decide between one verdict and another. Those that only bound the time of a

@@ -18,7 +18,7 @@ from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
@@ -195,7 +195,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     """
     tests, rejected = step.tests, dict(step.rejected)
     singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
-    weights = weights_of(list(singles.values()))
     effects = {effect.name: effect for effect in tests.effects}
     rows = []
     for name, single in singles.items():
@@ -206,7 +205,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             in_answer_set=in_answer_set,
             reason=rejected.get(name, single.reason),
             along=single.others if in_answer_set else (),
-            posterior_weight=weights[name],
             confounded_by=tuple(each for each in step.confounded if each.parameter.split(".")[0] == name),
         )
         rows.append(row)

@@ -13,10 +13,9 @@ import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
-from vinetrack.diagnosis.score_test import is_plausible, plausible_range, slip_of
-from vinetrack.effects import Effect, Parameter
+from vinetrack.diagnosis.score_test import is_plausible
+from vinetrack.effects import Effect
 from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances, with_systematics
 from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.fit_summary import FILM
@@ -159,82 +158,7 @@ def film_gain(fit: Fit) -> float:
 
 
 # ------------------------------------------------------------------------------
-# Priors from plausible ranges, and the marginal likelihoods and posterior probabilities of hypotheses with them.
-#
-# A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b −
-# a)/4: the range holds 95 % of it. With a likelihood that is normal about its maximum θ̂ with covariance Σ, the
-# marginal likelihood of a hypothesis is
-#
-#     ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
-#
-# which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). Each
-# parameter of a hypothesis costs ln(σ/τ), and sizes outside the range cost more. What all hypotheses share cancels.
-
-# Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
-# penalised (derived)
-RANGE_EDGE_DISTANCE = 4.0
-
-
-def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
-    """Mean and standard deviation of the prior of a plausible range, in the parameter's unit. A size that a common slip
-    in the sheet would produce has its prior about that size, as wide as ordinary errors.
-    """
-    low, high = plausible_range(parameter)
-    mean, sd = 0.5 * (low + high), 0.25 * (high - low)
-    slip = slip_of(parameter, number.value, number.sigma)
-    return (mean, sd) if slip is None else (slip[0] + (1 + slip[0]) * mean, (1 + slip[0]) * sd)
-
-
-def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """Penalty of sizes outside their plausible ranges, on the scale of −2 ln L; 0 inside."""
-    total = 0.0
-    for number in fit.numbers:
-        parameter = parameters.get(number.key)
-        if parameter is None or not math.isfinite(number.sigma) or number.value == parameter.zero:
-            continue
-        mean, sd = _prior_of(parameter, number)
-        variance = number.sigma**2 + sd**2
-        if variance > 0:
-            total += max((number.value - mean) ** 2 / variance - RANGE_EDGE_DISTANCE, 0.0)
-    return total
-
-
-def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant common to all fits of the same trials.
-    Parameters that no trajectory depends on, or that have no finite standard error, keep their prior and cost nothing.
-    """
-    indices, means, sds = [], [], []
-    for k, number in enumerate(fit.numbers):
-        parameter = parameters.get(number.key)
-        if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
-            mean, sd = _prior_of(parameter, number)
-            if sd > 0:
-                indices.append(k)
-                means.append(mean)
-                sds.append(sd)
-    if not indices:
-        return fit.log_likelihood
-    values = np.array([fit.numbers[k].value for k in indices])
-    scale = np.array(sds)
-    covariance = fit.covariance[np.ix_(indices, indices)] / scale[:, None] / scale
-    deviation = (values - np.array(means)) / scale
-    predictive = covariance + np.eye(len(indices))
-    occam = 0.5 * (_log_det(covariance) - _log_det(predictive))
-    return float(fit.log_likelihood + occam - 0.5 * deviation @ np.linalg.solve(predictive, deviation))
-
-
-def _log_det(matrix: Floats) -> float:
-    return float(np.linalg.slogdet(matrix + 1e-300 * np.eye(len(matrix)))[1])
-
-
-def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
-    """Posterior probabilities of hypotheses of equal prior probability; they add up to 1."""
-    if not log_evidences:
-        return []
-    values = np.array(log_evidences)
-    weights = np.exp(values - values.max())
-    return [float(weight) for weight in weights / weights.sum()]
-
+# Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
 
 ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of the best cannot be excluded (derived)
 
@@ -261,8 +185,6 @@ class LikelihoodRatio:
     reason: Remark
     credible: bool = True
     inflation: float = 1.0
-    prior_penalty: float = 0.0  #: penalty of sizes outside their plausible range, on the scale of −2 ln L
-    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.likelihood_ratio`
     film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.likelihood_ratio`
     split: tuple[str, ...] = ()  #: parameters of the model that it splits by groups of trials
 
@@ -311,7 +233,6 @@ def likelihood_ratio(
     delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
     plausible, reason = plausibility(effects, after)
-    parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
     compatible_with_none = _compatible_with_none(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
@@ -322,8 +243,6 @@ def likelihood_ratio(
         reason=compatible_with_none or reason,
         credible=not compatible_with_none and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
         inflation=ratio**2,
-        prior_penalty=prior_penalty(after, parameters),
-        log_evidence=log_evidence(after, parameters),
         film_gain=film_gain(after),
     )
 
@@ -446,14 +365,10 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     likely = [hypothesis for hypothesis in hypotheses if excess(hypothesis) <= ANSWER_SET_DELTA_CHI2]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
 
-    def penalised(hypothesis: LikelihoodRatio) -> float:
-        return excess(hypothesis) + hypothesis.prior_penalty
-
-    lowest = min(penalised(ratio) for ratio in likely)
-    plausible = [ratio for ratio in likely if penalised(ratio) - lowest <= ANSWER_SET_DELTA_CHI2]
-    rejected = {
-        ratio.label: ratio.reason or remark("outside_plausible_range") for ratio in likely if ratio not in plausible
-    }
+    # Sizes outside the plausible range are believed where no other hypothesis has plausible ones.
+    credible = [ratio for ratio in likely if ratio.credible]
+    plausible = [ratio for ratio in credible if ratio.plausible] or credible or likely
+    rejected = {ratio.label: ratio.reason for ratio in likely if ratio not in plausible}
     members = []
     for ratio in plausible:
         # 4.0: squared distance of two predictions, in units of the noise, below which they count as the same
@@ -469,10 +384,6 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
         else:
             members.append(ratio)
-    credible = [hypothesis for hypothesis in members if hypothesis.credible]
-    if credible and len(credible) < len(members):
-        rejected |= {hypothesis.label: hypothesis.reason for hypothesis in members if not hypothesis.credible}
-        members = credible
     return members, rejected
 
 
@@ -481,22 +392,6 @@ def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     trials: as every trial has its deviations of B and pressure, all of these predict the same curves.
     """
     return all(ratio.effects[-1].kind != BETWEEN_TRIALS for ratio in (hypothesis, other))
-
-
-def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
-    """Posterior probabilities of hypotheses by label, equally likely beforehand; they add up to 1. ln L is divided by
-    the best one's inflation. The film mass of each vine is free within `FILM_ERROR` of the stated value.
-    """
-    if not hypotheses:
-        return {}
-    inflation = best_of(hypotheses).inflation
-    tempered = [
-        hypothesis.log_evidence
-        - hypothesis.fit.log_likelihood
-        + (hypothesis.fit.log_likelihood + 0.5 * hypothesis.film_gain) / inflation
-        for hypothesis in hypotheses
-    ]
-    return dict(zip((hypothesis.label for hypothesis in hypotheses), posterior_weights(tempered), strict=True))
 
 
 def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:

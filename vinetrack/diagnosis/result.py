@@ -131,7 +131,6 @@ class Candidate(JsonRecord):
     reason: Annotated[StoredRemark, Field(alias="reason_code")] = field(default_factory=Remark)
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
-    posterior_weight: OrNaN = math.nan
     confounded_by: tuple[Confounder, ...] = ()
 
     def to_json(self) -> dict[str, Any]:

@@ -241,7 +241,7 @@ def _shared_remedies(numbers: Sequence[Number]) -> list[str]:
 
 
 def _instead(diagnosis: Diagnosis) -> tuple[str, str]:
-    """The other members of the answer set with their weights; else the nearest rivals, and why they are none."""
+    """The members of the answer set; else the nearest rivals, and why they are none."""
     fitted = [row for row in diagnosis.ranking if row.status == REFITTED and is_finite(row.delta_chi2)]
     members = [row for row in fitted if row.in_answer_set]
     rivals = sorted((row for row in fitted if not row.in_answer_set), key=lambda row: -row.delta_chi2)
@@ -249,8 +249,7 @@ def _instead(diagnosis: Diagnosis) -> tuple[str, str]:
     why = "; ".join(_why_not(row, best) for row in rivals[:MOST_NAMED])
     if len(members) < 2:
         return ("" if diagnosis.verdict == ADEQUATE else why), ""
-    weights = [f" {100 * row.posterior_weight:.0f} %" if row.posterior_weight > 0 else "" for row in members]
-    return ", ".join(f"{spaced_name(row.effect)}{w}" for row, w in zip(members, weights, strict=True)), why
+    return ", ".join(spaced_name(row.effect) for row in members), why
 
 
 def _why_not(row: Candidate, best: float) -> str:
