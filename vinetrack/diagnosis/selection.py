@@ -9,7 +9,8 @@ is added: first single effects are tried, then sets of two to five. If no set pa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -61,16 +62,10 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# Sets of several effects, by forward and backward steps.
-#
-# Forward, effects are added to the best sets of k effects: those that the score tests predict to improve the fit most.
-# Backward, each member of the best set of k + 1 is removed: an effect added early may only have stood in for two added
-# later, and a smaller set that is better than all known of its size is followed instead (floating search; Pudil,
-# Novovičová & Kittler, Pattern Recognition Letters 15, 1119, 1994).
+# Sets of several effects, by forward steps: effects are added to the best sets of k effects, those that the score tests
+# predict to improve the fit most.
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
-
-MIN_LOG_LIKELIHOOD_GAIN = 1.0  # Difference in ln L from which a fit counts as better (chosen)
 
 Names = frozenset[str]
 
@@ -109,20 +104,9 @@ class EffectSets:
         """Sets of this many effects on which larger ones are built."""
         of_size = self.of_size(size)
         best_gain = max((hypothesis.delta_chi2 for hypothesis in of_size), default=0.0)
-        strong = [hypothesis for hypothesis in of_size if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * best_gain]
-        if size == 1:
-            # 3: best single effects from which pairs are built (chosen)
-            return strong[:3]
-        # 2: best sets of one effect fewer from which larger ones are built (chosen)
-        return strong[:2]
-
-    def prune(self, hypothesis: LikelihoodRatio) -> bool:
-        """Backward step: remove each member from a set in turn."""
-        size = len(hypothesis.effects) - 1
-        best = max((known.fit.log_likelihood for known in self.of_size(size)), default=-math.inf)
-        for effect in hypothesis.effects:
-            self.leave_out(hypothesis, effect)
-        return self.of_size(size)[0].fit.log_likelihood > best + MIN_LOG_LIKELIHOOD_GAIN
+        # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
+        best = of_size[: 3 if size == 1 else 2]
+        return [hypothesis for hypothesis in best if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * best_gain]
 
     def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
         """Fit a set without one of its members, from where the set ended; None where no fit succeeds. A fit of the
@@ -133,40 +117,29 @@ class EffectSets:
         if (hypothesis.label, effect.name) not in self.left_out:
             self.left_out.add((hypothesis.label, effect.name))
             self.search.report(f"taking out {effect.name}")
-            fit = self._refitted(hypothesis.fit, others)
-            if fit is not None:
-                self._keep_best(likelihood_ratio(self.before, others, fit))
+            self._refit(hypothesis.fit, others)
         return self.fitted.get(frozenset(other.name for other in others))
 
     def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
         """Some members of a set alone, refitted from the set unless known already; None where the fit fails."""
         names = frozenset(effect.name for effect in effects)
         if names not in self.fitted:
-            fit = self._refitted(hypothesis.fit, effects)
-            if fit is not None:
-                self._keep_best(likelihood_ratio(self.before, effects, fit))
+            self._refit(hypothesis.fit, effects)
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
 
-    def _refitted(self, fit: Fit, effects: Iterable[Effect]) -> Fit | None:
-        try:
-            return refit(fit, self.before.model.with_effects(effects))
-        except (FitError, SimulationError, np.linalg.LinAlgError):
-            return None
-
-    def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
-        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known."""
-        others = self.leave_out(hypothesis, effect)
-        return 0.0 if others is None else _worth(hypothesis, others, (effect,))
+    def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
+        """Keep a set that is fitted from another one, unless no fit succeeds."""
+        with suppress(FitError, SimulationError, np.linalg.LinAlgError):
+            after = refit(fit, self.before.model.with_effects(effects))
+            self._keep_best(likelihood_ratio(self.before, effects, after))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
-        """Find the first member of a set whose significance given the others is too low."""
+        """Find the first member of a set whose significance given the others is too low, or not known."""
         for effect in hypothesis.effects:
-            others = frozenset(other.name for other in hypothesis.effects if other is not effect)
-            sigmas = self.member_sigmas(hypothesis, effect)
-            required = SEARCH_SIGMAS
-            smaller = self.fitted.get(others)
-            if smaller is not None:
+            sigmas, required = 0.0, SEARCH_SIGMAS
+            if (smaller := self.leave_out(hypothesis, effect)) is not None:
+                sigmas = _worth(hypothesis, smaller, (effect,))
                 required = max(required, self.search.tests_after(smaller.fit).family.threshold(effect.name))
             if sigmas < required:
                 return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
@@ -233,41 +206,37 @@ def adequate_hypotheses(
     (tests of the model with the first adequate hypothesis added).
     """
     in_answer_set, rejected = answer_set(hypotheses)
-    best = best_of(hypotheses)
-    others = sorted(
-        (hypothesis for hypothesis in hypotheses if hypothesis not in in_answer_set),
-        key=lambda hypothesis: -hypothesis.fit.log_likelihood,
-    )
-    next_best = [
+    best, by_likelihood = best_of(hypotheses), sorted(hypotheses, key=lambda ratio: -ratio.fit.log_likelihood)
+    within_reach = [
         hypothesis
-        for hypothesis in others
-        if hypothesis.label not in rejected and hypothesis.deviance_excess(best) < OUT_OF_REACH
+        for hypothesis in by_likelihood
+        if hypothesis.label not in rejected
+        and (hypothesis in in_answer_set or hypothesis.deviance_excess(best) < OUT_OF_REACH)
     ]
-    for group in (in_answer_set, next_best):
-        adequate: list[LikelihoodRatio] = []
-        after: MisfitTests | None = None
-        for hypothesis, film_free in [(each, film_free) for film_free in (False, True) for each in group]:
-            # With the best, film of another mass is a set of two effects, unless an equally likely hypothesis is
-            # adequate with the film as stated.
-            only_best = hypothesis is best and not adequate
-            if film_free and (hypothesis in adequate or only_best or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
-                continue
-            tests = search.tests_after(hypothesis.fit, film=film_free) if hypothesis.credible else None
-            # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
-            # first round, which rejects more readily.
-            if tests is None:
-                rejected[hypothesis.label] = hypothesis.reason
-            elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.rejects_at_first_round_level):
-                rejected[hypothesis.label] = MISFIT_REMAINS
-            elif sets is not None and len(hypothesis.effects) > 2 and (reason := sets.superfluous(hypothesis)):
-                rejected[hypothesis.label] = reason
-            elif not adequate or hypothesis in answer_set([*adequate, hypothesis])[0]:
-                adequate.append(hypothesis)
-                after = after or tests
-                rejected.pop(hypothesis.label, None)
-        if adequate:
-            return sorted(adequate, key=lambda ratio: -ratio.fit.log_likelihood), rejected, after
-    return [], rejected, None
+    adequate: list[LikelihoodRatio] = []
+    after: MisfitTests | None = None
+    for hypothesis, film_free in [(each, film_free) for film_free in (False, True) for each in within_reach]:
+        # With the best, film of another mass is a set of two effects, unless an equally likely hypothesis is adequate
+        # with the film as stated.
+        only_best = hypothesis is best and not adequate
+        if film_free and (hypothesis in adequate or only_best or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
+            continue
+        if hypothesis not in answer_set([*adequate, hypothesis])[0]:
+            continue
+        tests = search.tests_after(hypothesis.fit, film=film_free) if hypothesis.credible else None
+        # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
+        # first round, which rejects more readily.
+        if tests is None:
+            rejected[hypothesis.label] = hypothesis.reason
+        elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.rejects_at_first_round_level):
+            rejected[hypothesis.label] = MISFIT_REMAINS
+        elif sets is not None and len(hypothesis.effects) > 2 and (reason := sets.superfluous(hypothesis)):
+            rejected[hypothesis.label] = reason
+        else:
+            adequate.append(hypothesis)
+            after = after or tests
+            rejected.pop(hypothesis.label, None)
+    return sorted(adequate, key=lambda ratio: -ratio.fit.log_likelihood), rejected, after
 
 
 # ------------------------------------------------------------------------------
@@ -425,8 +394,6 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     return likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
-MAX_BACKWARD_STEPS = 2  # Times that a search over sets goes on from a smaller set (chosen)
-
 # Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
 # (chosen)
 PARTIAL_SHARE = 0.5
@@ -537,9 +504,8 @@ def _effect_set_rounds(
     """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`."""
     singles = sorted(hypotheses, key=lambda single: -single.fit.log_likelihood)
     sets = EffectSets(search, singles)
-    size, backward_steps, best_so_far = 2, 0, singles[0]
-    rejected: dict[str, Remark] = {}
-    while size <= MAX_EFFECTS:
+    best_so_far, rejected = singles[0], dict[str, Remark]()
+    for size in range(2, MAX_EFFECTS + 1):
         search.report(f"{size} effects together")
         of_this_size = sets.grow(size)
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
@@ -552,9 +518,6 @@ def _effect_set_rounds(
         if not sets.is_better(of_this_size[0]):
             break
         best_so_far = of_this_size[0]
-        # An effect added early may have stood in for two added later: go on from a smaller set if that is now better.
-        step_back = size > 2 and backward_steps < MAX_BACKWARD_STEPS and sets.prune(of_this_size[0])
-        size, backward_steps = (size - 1, backward_steps + 1) if step_back else (size + 1, backward_steps)
     fitted = tuple(sets.fitted.values())
     reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
     steps = _partial_steps(tests, sets)
