@@ -76,10 +76,6 @@ def test_detectable_sizes_follow_the_normal_distribution_and_small_effects_linea
     assert not power["air_drag"].is_visible
     k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
     assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
-    moved_m = size * linear_power.residual_displacements(six.fit, six.products)[k]
-    after = linear_power.fitted_without(start, six.sensitivities.shapes[k], size)
-    left = [block[:, -1] for block in after.solution.columns]
-    assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
 
 @pytest.mark.slow

@@ -28,7 +28,6 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, PROB
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
-    Products,
     effect_sensitivities,
     plausible_range,
     products_of,
@@ -41,10 +40,9 @@ from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
-from vinetrack.inference.gaussian_processes import at_correlation
-from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
+from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.planning.candidate_trials import at_solution, extended_fit
 
@@ -139,34 +137,6 @@ def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> 
     return replace(trial_data, lead_position_m=position_m, first=first, **of_points)
 
 
-def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
-    """Sizes at which an effect moves positions by as much as their systematic errors. Returns deviations from absence,
-    SI, positive; 0 where positions have no such errors. Shape (n_shapes,).
-    """
-    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in tests.fit.predictor.data]))
-    if not systematic_m > 0:
-        return np.zeros(len(tests.sensitivities.shapes))
-    return np.asarray(systematic_m / np.maximum(residual_displacements(tests.fit, tests.products), 1e-300))
-
-
-def residual_displacements(fit: Fit, products: Products) -> Floats:
-    """Distance of a fit without an effect from trajectories with a unit of its size, to first order. Returns root mean
-    square over trials of the largest distance, all parameters and trial effects re-estimated. Shape (n_shapes,).
-    """
-    problem, state, n_unknowns = products.problem, fit.state, products.n_unknowns
-    lever = np.vstack([projected(fit, products, state).lever_of_fit, np.zeros((1, products.n_shapes))])
-    precision = trial_effect_prior(problem, state)[1]
-    largest = []
-    for part in products.parts:
-        white = at_correlation(products.cross_products(part), state.rho) / state.variance[part, None, None]
-        response = eliminated(white, precision[part])[1]
-        for columns, of_effects, places in zip(products.columns[part], response, problem.index[part], strict=True):
-            own = columns[:, N_TRIAL_EFFECTS:] - columns[:, :N_TRIAL_EFFECTS] @ of_effects
-            left = own[:, n_unknowns + 1 :] - own[:, :n_unknowns] @ lever[places]
-            largest.append(np.max(np.abs(left), axis=0))
-    return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
-
-
 # ------------------------------------------------------------------------------
 # Detectable sizes: the distribution of every score at a size, against the threshold of its candidate.
 
@@ -188,7 +158,7 @@ def power_of(
     start = noiseless_start(tests.fit) if nonlinear else None
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
     normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
-    known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests), sizes_at_systematic_error(tests)
+    known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests)
     asked = [effect for effect in tests.effects if only in ("", effect.name)]
     powers = [_effect_power(tests, effect, start, *known) for effect in asked]
     return Power(
@@ -249,7 +219,6 @@ def _effect_power(
     start: Fit | None,
     null_scores: Floats,
     inflation: Floats,
-    least: Floats,
 ) -> EffectPower | None:
     """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %; those of finite
     size from linear theory, without `start`.
@@ -279,11 +248,6 @@ def _effect_power(
     # The sizes at which the score has these means: proportional below the first size and beyond the last
     between = np.interp(needed, [0.0, *means], [0.0, *sizes])
     steps = np.where(needed >= means[-1], sizes[-1] * needed / means[-1], between)
-    if not shape.whole and np.isfinite(steps).all():
-        # A detection below the size that systematic errors imitate counts with probability one half.
-        away, smallest = np.abs(steps), float(least[typical[0]])
-        at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, away, right=math.inf)
-        steps = np.sign(steps) * np.where(away >= smallest, away, np.minimum(at_half_power, smallest))
     at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
     taken_for = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
     zero, of_size = 0.0, {"parameter": "", "symbol": "size", "unit": "1"}
@@ -322,7 +286,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     passes = SCORE_GRID / inflation >= limit
     threshold = float(SCORE_GRID[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
-    by_trial = np.maximum(scores.trial_informations[:, index, index], 0.0)
+    by_trial = np.maximum(scores.trial_informations[:, index], 0.0)
     trials, total = by_trial.size, float(by_trial.sum())
     if trials < FEWEST_CLUSTERS or not total > 0:
         return threshold - draw.standard_normal(DRAWS)

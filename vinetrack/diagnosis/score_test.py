@@ -382,7 +382,7 @@ def products_without_trial_effects(products: Products, state: FitState) -> Float
 
 @dataclass(frozen=True)
 class Scores:
-    """Score statistics of every shape given the fit, per unit of its size."""
+    """Score statistics of every shape given the fit, per unit of its size; those of trials (n_trials, n_shapes)."""
 
     score: Floats
     information: Floats
@@ -421,7 +421,7 @@ class Scores:
         trials, see `cluster_variance`.
         """
         diagonal = np.diag(self.information)
-        residual = self.trial_scores - np.einsum("njj->nj", self.trial_informations) * self.size
+        residual = self.trial_scores - self.trial_informations * self.size
         scatter = np.sqrt(cluster_variance(residual, self.fitted, self.groups))
         return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
 
@@ -451,15 +451,12 @@ class Scores:
 class Projection:
     """Shapes with the trial effects eliminated and the unknowns projected off. `blocks`, shape (n_trials, q, q), are
     cross products of unknowns, residual and shapes; `lever` and `step` are the change of the unknowns by a unit of each
-    shape's size, and by the residual; `lever_of_fit` and `step_of_fit` are the same with systematic errors held at
-    zero, as in the fit.
+    shape's size, and by the residual; `fitted` counts the parameters of the fit that are estimated.
     """
 
     blocks: Floats
     lever: Floats
     step: Floats
-    lever_of_fit: Floats
-    step_of_fit: Floats
     fitted: int
     score: Floats
     information: Floats
@@ -479,14 +476,12 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     np.add.at(cross, problem.index, blocks[:, X, C])
     total = blocks[:, C, C].sum(axis=0)
     estimated = _adapting(fit, problem, hessian)
-    of_fit = estimated[estimated < state.theta.size]
-    inverse, held = inverse_of_block(hessian, estimated), inverse_of_block(hessian, of_fit)
+    inverse, fitted = inverse_of_block(hessian, estimated), int(np.count_nonzero(estimated < state.theta.size))
     lever, step = inverse @ cross[:-1], inverse @ gradient
     information, empty = _without_rounding(total - cross[:-1].T @ lever, total)
     score = blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step
     score[empty] = 0.0
-    lever_of_fit, step_of_fit = held @ cross[:-1], held @ gradient
-    return Projection(blocks, lever, step, lever_of_fit, step_of_fit, of_fit.size, score, information, empty)
+    return Projection(blocks, lever, step, fitted, score, information, empty)
 
 
 def levers_of(fit: Fit, products: Products) -> Floats:
@@ -504,21 +499,16 @@ def levers_of(fit: Fit, products: Products) -> Floats:
 
 def scores_of(fit: Fit, products: Products) -> Scores:
     """Compute the scores at a fit."""
-    projection = projected(fit, products, fit.state)
-    count, p = products.n_shapes, products.n_unknowns
-    X, r, C = slice(0, p), p, slice(p + 1, None)
-    # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
-    # the scatter of trials: the residuals are those of the fit.
-    lever, lever_of_fit = np.pad(projection.lever, ((0, 1), (0, 0))), np.pad(projection.lever_of_fit, ((0, 1), (0, 0)))
-    step = np.append(projection.step_of_fit, 0.0)
-    trials = len(projection.blocks)
-    trial_scores, trial_informations = np.empty((trials, count)), np.empty((trials, count, count))
-    for i, (block, places) in enumerate(zip(projection.blocks, products.problem.index, strict=True)):
-        moved, own = lever_of_fit[places], lever[places]
-        residual = block[:, r] - block[:, X] @ step[places]
-        trial_scores[i] = residual[C] - residual[X] @ own
-        trial_informations[i] = block[C, C] - block[C, X] @ moved - own.T @ (block[X, C] - block[X, X] @ moved)
+    projection, index, p = projected(fit, products, fit.state), products.problem.index, products.n_unknowns
+    X, r, C, blocks = slice(0, p), p, slice(p + 1, None), projection.blocks
+    # Unknowns to which a trial does not respond point at a last row of zeros.
+    lever, step = np.pad(projection.lever, ((0, 1), (0, 0)))[index], np.append(projection.step, 0.0)[index]
+    residual = blocks[:, :, r] - np.einsum("nap,np->na", blocks[:, :, X], step)
+    trial_scores = residual[:, C] - np.einsum("npk,np->nk", lever, residual[:, X])
     trial_scores[:, projection.empty] = 0.0
+    trial_informations = np.einsum("nkk->nk", blocks[:, C, C]) + np.einsum(
+        "npk,npk->nk", lever, blocks[:, X, X] @ lever - 2 * blocks[:, X, C]
+    )
     groups = coarsest_groups([trial.trial for trial in fit.trials])
     return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)
 
