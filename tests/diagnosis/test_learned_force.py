@@ -231,7 +231,7 @@ def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:
     motion = SimpleNamespace(**{name: np.array([value]) for name, value in where.items()})
     motion.trial = SimpleNamespace(condition="one")
     found, weights = smooth.Posterior(*known, 50.0, 0, 0.1), {domain.name: 1.0}
-    return learning.LearnedForce(domain, found, [motion], weights, (), 50.0, 0.99, True)
+    return learning.LearnedForce(domain, found, [motion], weights, (), 0.99, True)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)

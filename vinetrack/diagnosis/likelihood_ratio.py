@@ -322,20 +322,6 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     return math.sqrt(max([1.0, *ratios]))
 
 
-def _distance(fit: Fit, other: Fit) -> float:
-    """Squared distance of the predictions of two fits, whitened by the AR(1) noise of the first."""
-    rho = fit.solution.state.rho
-    total = 0.0
-    data = fit.predictor.data
-    for a, b, variance, trial_data in zip(fit.trials, other.trials, fit.solution.state.variance, data, strict=True):
-        difference = a.predicted_position_m - b.predicted_position_m
-        if trial_data.relative_sd is not None:
-            difference = difference / trial_data.relative_sd
-        innovations = difference[1:] - rho * difference[:-1]
-        total += float(np.sum(innovations**2) + (1 - rho**2) * difference[0] ** 2) / float(variance)
-    return total
-
-
 def _complexity(hypothesis: LikelihoodRatio) -> int:
     """Number of parameters of its effects."""
     return sum(len(effect.parameters) for effect in hypothesis.effects)
@@ -371,27 +357,18 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     rejected = {ratio.label: ratio.reason for ratio in likely if ratio not in plausible}
     members = []
     for ratio in plausible:
-        # 4.0: squared distance of two predictions, in units of the noise, below which they count as the same
-        # curve (derived)
         simpler = [
             other
             for other in plausible
             if other.deviance_excess(ratio) <= ANSWER_SET_DELTA_CHI2 * best.inflation
             and _complexity(other) < _complexity(ratio)
-            and (_contains(ratio, other) or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < 4.0))
+            and _contains(ratio, other)
         ]
         if simpler:
             rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
         else:
             members.append(ratio)
     return members, rejected
-
-
-def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
-    """Whether equal predictions mean that one hypothesis is a limit of the other. They do not for differences between
-    trials: as every trial has its deviations of B and pressure, all of these predict the same curves.
-    """
-    return all(ratio.effects[-1].kind != BETWEEN_TRIALS for ratio in (hypothesis, other))
 
 
 def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:

@@ -164,7 +164,7 @@ def power_of(
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,
-        false_alarms=_false_alarms(tests.fit),
+        false_alarm_rate=_false_alarm_rate(tests.fit),
         effects=tuple(power for power in powers if power is not None),
         not_testable={**(not_testable or {}), **dict.fromkeys(tests.sensitivities.silent, remark("no_response"))},
         numbers=_interval_widths(tests.fit),
@@ -355,18 +355,13 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     return {name: rates[name] for name in listed}
 
 
-def _false_alarms(fit: Fit) -> dict[str, float]:
-    """False-alarm rate of every test of the first round, as `misfit_tests` and `selection` set their levels."""
-    level = FALSE_ALARM_LEVEL_FIRST_ROUND
-    rates = {
-        "scores of all candidates": level,
-        "any smooth force": min(PROBE_LEVEL, level),
-        "replicates that err alike": 0.1 * level,
-    }
-    trials = [trial.trial for trial in fit.trials]
-    if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):
-        rates["specimens, days or the order of trials"] = level
-    return rates
+def _false_alarm_rate(fit: Fit) -> float:
+    """Upper bound on the false-alarm rate of the first round: the sum of the levels of its tests, of all candidates, of
+    any smooth force, of replicates that err alike, and of specimens, days or the order where they are stated.
+    """
+    level, trials = FALSE_ALARM_LEVEL_FIRST_ROUND, [trial.trial for trial in fit.trials]
+    stated = any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials)
+    return level + min(PROBE_LEVEL, level) + 0.1 * level + level * stated
 
 
 def _interval_widths(fit: Fit) -> tuple[NumberWidth, ...]:

@@ -289,14 +289,8 @@ class LearnedForce(SmoothForce):
 
     weights: Mapping[str, float]
     not_excluded: tuple[str, ...]
-    log_bayes_factor: float
     explained: float
     is_repeated: bool
-
-    @property
-    def likeliest(self) -> tuple[str, tuple[float, ...]]:
-        """What the force is where growth begins, and its length scales: the most likely of those averaged over."""
-        return self.domain.hypotheses[self.found.hypothesis]
 
     @property
     def visited(self) -> pd.DataFrame:
@@ -312,7 +306,7 @@ class LearnedForce(SmoothForce):
             name=self.domain.name,
             weights=self.weights,
             alternatives=self.not_excluded,
-            begins=self.likeliest[0] if self.domain.start_axis >= 0 else "",
+            begins=self.domain.hypotheses[self.found.hypothesis][0] if self.domain.start_axis >= 0 else "",
             range_N=(float(force_N.min()), float(force_N.max())),
             sigma_N=float(self.visited["sigma_N"].median()),
             explained=self.explained,
@@ -322,16 +316,11 @@ class LearnedForce(SmoothForce):
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
-        at_start, length_scales = self.likeliest
         return {
             "variables": list(self.domain.variables),
             "weights": dict(self.weights),
             "not_excluded": list(self.not_excluded),
-            "length_scales": dict(zip(self.domain.variables, length_scales, strict=True)),
-            "amplitude_N": self.found.amplitude,
-            "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": at_start,
             "sentence": str(self.sentence),
         }
 
@@ -341,9 +330,11 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
     the number of points, as the evidence against no force, as first seen from the tracks.
     """
     misfit = first[0].equations.chi2 - problem.n_points
-    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in first}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
-    if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
+    if (
+        misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points
+        or max(choice.found.log_evidence for choice in first) < 18.0
+    ):
         return None
     inflation = problem.inflation(_least_chi2(choices))
     unit = max(LEAST_DIFFERENCE * _least_chi2(choices) / inflation, 1.0)
@@ -366,7 +357,6 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
         motions=best.motions,
         weights=weights,
         not_excluded=tuple(others),
-        log_bayes_factor=log_bayes_factors[domain.name],
         explained=min(explained, 1.0),
         is_repeated=bool(problem.scatter.dof),
     )
@@ -424,10 +414,10 @@ class RankedLaw:
     @property
     def row(self) -> dict[str, Any]:
         """As a row of `laws` in `diagnosis.json`."""
-        amplitude, of_law = self.estimate.amplitude, {"law": self.law.name, "words": self.words}
+        amplitude, sigma_N = self.estimate.amplitude, self.estimate.sigma
         size_N = float(amplitude[0]) if amplitude.size == 1 else math.hypot(*amplitude)
-        sizes = {"explained": self.explained, "amplitude_N": size_N, "sigma_N": self.estimate.sigma}
-        return of_law | sizes | {"delta_chi2": self.estimate.delta_chi2, "bic": self.bic}
+        of_law = {"law": self.law.name, "words": self.words, "explained": self.explained}
+        return of_law | {"amplitude_N": size_N, "sigma_N": sigma_N}
 
 
 def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:

@@ -176,13 +176,13 @@ StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSeriali
 @dataclass(frozen=True)
 class Power(JsonRecord):
     """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
-    `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
-    each test to its false-alarm rate; the total is at most their sum.
+    `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. The probability of
+    any false alarm is at most `false_alarm_rate`.
     """
 
     n_trials: int = 0
     threshold: Annotated[OrNaN, Field(alias="threshold_sigma")] = math.nan
-    false_alarms: Mapping[str, OrNaN] = field(default_factory=dict)
+    false_alarm_rate: OrNaN = math.nan
     effects: tuple[EffectPower, ...] = ()
     not_testable: Annotated[Mapping[str, StoredRemark], Field(alias="not_testable_codes")] = field(default_factory=dict)
     numbers: tuple[NumberWidth, ...] = ()
@@ -192,11 +192,6 @@ class Power(JsonRecord):
     # Written below, and not read again
     simulated: Annotated[tuple[SimulatedRates, ...], Field(exclude=True, alias="unread_simulated")] = ()
     further: Annotated[tuple[FurtherTrials, ...], Field(exclude=True)] = ()
-
-    @property
-    def false_alarm_rate(self) -> float:
-        """Upper bound on the probability of any false alarm: the sum over all tests (Bonferroni)."""
-        return float(sum(self.false_alarms.values()))
 
     def __getitem__(self, name: str) -> EffectPower:
         """The power for an effect, by its name."""
@@ -216,7 +211,6 @@ class Power(JsonRecord):
         """As `power` of `diagnosis.json`; sizes in SI units."""
         return {
             **super().to_json(),
-            "false_alarm_rate": self.false_alarm_rate,
             "effects": [entry.to_json() for entry in self.effects],
             "not_testable": {name: str(why) for name, why in self.not_testable.items()},
             "wary": str(self.wary),
