@@ -1,6 +1,6 @@
 """Locate where a model fails by more than the scatter of replicates, and which of its parameters drift.
 
-By condition; along time, position and speed; and by which parameter drifts with a condition on which it should not
+By condition; along the growth; and by which parameter drifts with a condition on which it should not
 depend. A prediction has its own release and origin and no other trial effect, as in `vinetrack.diagnosis.ladder`.
 Standard errors are those of the mean over trials, from the scatter of replicates (`vinetrack.diagnosis.replicates`): a
 thousand frames of one trial are one trial.
@@ -28,7 +28,6 @@ from vinetrack.diagnosis.replicates import (
     Stretches,
     align_trials,
     by_condition,
-    common_edges,
     common_stretches,
     orthogonal_part,
     replicate_scatter,
@@ -58,9 +57,7 @@ class Failure:
 
     pressure_unit: str
     by_condition: pd.DataFrame
-    along_time: pd.DataFrame
     along_position: pd.DataFrame
-    along_speed: pd.DataFrame
     scatter: Scatter
     drift: Drift
 
@@ -104,9 +101,7 @@ def locate(fit: Fit) -> Failure:
     return Failure(
         pressure_unit=predicted[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_time=_table("time_s", "s", courses, scatter),
-        along_position=_table("lead_position_m", "m", courses, scatter),
-        along_speed=_table("lead_velocity_m_s", "m_s", courses, scatter),
+        along_position=_residual_along_growth(courses, scatter),
         scatter=scatter,
         drift=drift(fit),
     )
@@ -148,28 +143,23 @@ def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter)
     }
 
 
-def _table(along: str, unit: str, courses: Sequence[ResidualCourse], scatter: Scatter) -> pd.DataFrame:
-    """Mean residual of every stretch over the trials that reach it, with its standard error: in stretches of time that
-    every replicate of a condition was recorded in, or of the growth or speed of a vine, whose trials are also averaged
-    together (condition blank).
+def _residual_along_growth(courses: Sequence[ResidualCourse], scatter: Scatter) -> pd.DataFrame:
+    """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
+    its standard error.
     """
     import pandas as pd
 
-    parts: list[tuple[Sequence[ResidualCourse], Floats, str]] = []
-    if along == "time_s":
-        parts = [(of, common_edges(of), name) for name, of in by_condition(courses).items()]
-    for vine in dict.fromkeys(course.trial.vine for course in courses) if not parts else ():
-        members = [course for course in courses if course.trial.vine == vine]
-        edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
-        parts += [(of, edges, name) for name, of in (*by_condition(members).items(), ("", members))]
     rows: list[tuple[object, ...]] = []
-    for of_part, edges, condition in parts:
-        in_stretches = [member.means(along, edges) for member in of_part]
+    for condition, members in by_condition(courses).items():
+        vine = members[0].trial.vine
+        reach_m = max(float(course.lead_position_m.max()) for course in courses if course.trial.vine == vine)
+        edges = np.linspace(0.0, reach_m, MAX_STRETCHES + 1)
+        in_stretches = [member.means("lead_position_m", edges) for member in members]
         means_m = np.array([means for means, _ in in_stretches])
         variances = np.array(
             [
                 np.diag(scatter.covariance(np.nan_to_num(means[:, 1:]), member.noise(count)))
-                for member, (means, count) in zip(of_part, in_stretches, strict=True)
+                for member, (means, count) in zip(members, in_stretches, strict=True)
             ]
         )
         present = np.isfinite(means_m).all(axis=2)
@@ -178,9 +168,8 @@ def _table(along: str, unit: str, courses: Sequence[ResidualCourse], scatter: Sc
             count = int(reached.sum())
             mean_m = float(means_m[reached, k, 0].mean())
             sigma_m = math.sqrt(float(variances[reached, k].sum())) / count
-            middle = (low + high) / 2
-            rows.append((of_part[0].trial.vine, condition, low, high, middle, mean_m, sigma_m, mean_m / sigma_m, count))
-    columns = ("vine", "condition", f"from_{unit}", f"to_{unit}", along, "mean_residual_m", "sigma_m", "z", "n_trials")
+            rows.append((vine, condition, low, high, (low + high) / 2, mean_m, sigma_m, mean_m / sigma_m, count))
+    columns = ("vine", "condition", "from_m", "to_m", "lead_position_m", "mean_residual_m", "sigma_m", "z", "n_trials")
     return pd.DataFrame(rows, columns=list(columns))
 
 

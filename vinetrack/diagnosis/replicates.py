@@ -317,7 +317,6 @@ class ResidualCourse:
     values_m: Floats
     time_s: Floats
     lead_position_m: Floats
-    lead_velocity_m_s: Floats
     position_m2: float
     noise_m2: float
     origin_m2: float
@@ -363,7 +362,6 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
         values_m=np.column_stack([trial.residual_m, response])[moved],
         time_s=trial.time_s[moved] - trial.release_s,
         lead_position_m=trial.predicted_position_m[moved] - trial.origin_m,
-        lead_velocity_m_s=trial.predicted_velocity_m_s[moved],
         position_m2=trial_data.mean_noise_m**2 + trial_data.position_systematic_m**2,
         noise_m2=noise_m2,
         origin_m2=noise_m2 / max(trial_data.n_rest, 1),

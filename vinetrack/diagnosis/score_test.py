@@ -46,7 +46,7 @@ from vinetrack.inference.systematics import Systematics
 
 NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
-REACH_SIGMAS = 3.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
+REACH_SIGMAS = 2.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
 
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5

@@ -228,9 +228,7 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     if (failure := diagnosis.failure) is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
-            "along_time.csv": failure.along_time,
             "along_position.csv": failure.along_position,
-            "along_speed.csv": failure.along_speed,
             "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
     return {name: table for name, table in tables.items() if table is not None}
