@@ -28,7 +28,7 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import result, score_test
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, film_gain
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import RankedLaw
 from vinetrack.diagnosis.replicates import with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
@@ -39,7 +39,6 @@ from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import variance_floor
-from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign
 from vinetrack.tracks.importers import flag_end_of_motion
@@ -113,14 +112,6 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
         assert np.any(alone.pop(trial.trial.vine))
         assert not any(np.any(of_other) for of_other in alone.values())
         np.testing.assert_allclose(columns[:, 1:].sum(axis=1), columns[:, 0], rtol=0.02, atol=1e-5)
-    # Film gains what a fit with free film gains, less its prior.
-    film_free = vt.refit(fit, fit.model + "film_mass")
-    sizes = [number.value for number in film_free.numbers if number.key == "film_mass.eps"]
-    fall = 2 * (film_free.log_likelihood - fit.log_likelihood)
-    gained = film_gain(fit)
-    # The prior pulls sizes in, so it costs less than at the sizes of the free fit, and more than nothing.
-    assert fall - sum((size / FILM_ERROR) ** 2 for size in sizes) < gained < fall
-    assert film_gain(film_free) == 0
 
 
 def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_has_one():
@@ -138,23 +129,18 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
 @pytest.mark.parametrize(
     ("given", "kept"),
     [
-        ({"length_scale": (100, 0, 1), "air_drag": (86, 0, 1)}, {"length_scale"}),
-        ({"length_scale": (100, 0, 1), "air_drag": (86, 27, 1)}, {"length_scale", "air_drag"}),
-        # With film off the drag is the likeliest, and the leak as far behind it as without.
-        ({"length_scale": (100, 0, 1), "air_drag": (86, 50, 1), "leak": (80, 50, 1)}, {"length_scale", "air_drag"}),
-        ({"film_mass": (100, 0, 1), "air_drag": (86, 30, 1)}, {"film_mass"}),
-        ({"film_mass": (96, 0, 1), "air_drag": (86, 30, 1)}, {"film_mass", "air_drag"}),
+        ({"length_scale": (100, 1), "air_drag": (86, 1)}, {"length_scale"}),
         # A form that contains the other gains 20 in −2 ln L: more than 9, less than 9 of noise three times as large.
-        ({"supply_refill": (110, 0, 1), "reservoir_depletion": (100, 0, 1)}, {"supply_refill"}),
-        ({"supply_refill": (110, 0, 3), "reservoir_depletion": (100, 0, 3)}, {"reservoir_depletion"}),
+        ({"supply_refill": (110, 1), "reservoir_depletion": (100, 1)}, {"supply_refill"}),
+        ({"supply_refill": (110, 3), "reservoir_depletion": (100, 3)}, {"reservoir_depletion"}),
     ],
 )
-def test_what_is_as_likely_with_film_a_little_off_is_excluded_only_by_film_alone(given, kept):
-    """By ln L, gain by film and inflation. A larger form must gain as much."""
+def test_what_fits_worse_is_excluded_and_a_larger_form_that_fits_no_better(given, kept):
+    """By ln L and inflation."""
     ratios = []
-    for name, (log_likelihood, gain, inflation) in given.items():
+    for name, (log_likelihood, inflation) in given.items():
         known = SimpleNamespace(log_likelihood=log_likelihood), 0.0, 0.0, True, Remark()
-        ratios.append(LikelihoodRatio((catalogue()[name],), *known, film_gain=gain, inflation=inflation))
+        ratios.append(LikelihoodRatio((catalogue()[name],), *known, inflation=inflation))
     assert {ratio.label for ratio in answer_set(ratios)[0]} == kept
 
 

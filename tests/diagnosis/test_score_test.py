@@ -106,7 +106,7 @@ def test_what_one_of_many_probes_feels_alone_is_heard():
 def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(monkeypatch):
     of, answers = scores(np.random.default_rng(20607), 12, 2), SimpleNamespace(shapes=[None])
     shaped = scores(np.random.default_rng(20607), 12, 2, sizes=9.0)
-    for name in ("effect_sensitivities", "_probe_shapes", "products_of", "_systematics"):
+    for name in ("effect_sensitivities", "_probe_shapes", "products_of"):
         monkeypatch.setattr(misfit_tests, name, lambda *_: answers)
     monkeypatch.setattr(misfit_tests, "between_conditions_p", lambda _: 1.0)
     monkeypatch.setattr(misfit_tests, "scores_of", lambda *_: of)

@@ -145,7 +145,7 @@ class CandidateFits:
     report: Report
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    tests_by_fit: list[tuple[Fit, bool, MisfitTests]] = field(default_factory=list)
+    tests_by_fit: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
 
     @property
     def names(self) -> list[str]:
@@ -153,15 +153,15 @@ class CandidateFits:
         names = dict.fromkeys(self.tests.sensitivities.effects)
         return sorted(names, key=lambda name: -self.tests.predicted_gain(name))
 
-    def tests_after(self, fit: Fit, *, film: bool = False) -> MisfitTests:
+    def tests_after(self, fit: Fit) -> MisfitTests:
         """Run the misfit tests of one of the fits, at the level of later rounds."""
-        for tested_fit, with_film, tests in self.tests_by_fit:
-            if tested_fit is fit and with_film == film:
+        for tested_fit, tests in self.tests_by_fit:
+            if tested_fit is fit:
                 return tests
-        tests = misfit_tests(with_curves(fit), self.tests.effects, FALSE_ALARM_LEVEL_LATER_ROUNDS, film=film)
+        tests = misfit_tests(with_curves(fit), self.tests.effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
         if is_large(fit):
             self.tests_by_fit.clear()
-        self.tests_by_fit.append((fit, film, tests))
+        self.tests_by_fit.append((fit, tests))
         return tests
 
     def fit(self, most: int | None = None, *, all_of_them: bool = False) -> list[LikelihoodRatio]:

@@ -16,17 +16,16 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
 from vinetrack.diagnosis.score_test import is_plausible
 from vinetrack.effects import Effect
-from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances, with_systematics
+from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
 from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
-from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.marginal_likelihood import (
     deviance,
     estimate_between_trial_sd,
     marginal,
 )
-from vinetrack.inference.optimiser import Solution, is_poor_fit
+from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
-from vinetrack.inference.systematics import systematics_of, with_unknowns
+from vinetrack.inference.systematics import with_unknowns
 
 # ------------------------------------------------------------------------------
 # Likelihood gain of a difference between trials, from the linear mixed model of a fit, without simulations.
@@ -128,36 +127,6 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
 
 
 # ------------------------------------------------------------------------------
-# Gain of a hypothesis if the film mass of each vine is a nuisance parameter.
-#
-# Which of two effects has the higher likelihood may depend on the mass of the film: where the truth was a drag on
-# film that is 1.5 % lighter than stated, a wrong scale was ahead of it by Δχ² 27. A hypothesis is therefore not
-# excluded if it fits as well as the best once the film mass of every vine is free within its usual error. The tests
-# of whether anything is missing use the stated mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
-
-
-def film_gain(fit: Fit) -> float:
-    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`²) of each vine's film mass, by linear algebra. ε
-    takes its best value, with its prior as a penalty; it is not integrated out. Returns at least 0; 0 for a fit that is
-    far off, has a free film mass already, or does not depend on it.
-    """
-    if FILM in fit.model or is_poor_fit(fit.predictor, fit.solution):
-        return 0.0
-    errors = systematics_of(fit.predictor, fit.solution, ["film"])
-    if not errors.count:
-        return 0.0
-    base = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
-    columns = errors.beside(base.columns)
-    with_film = replace(
-        base,
-        state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
-        problem=errors.among(base.problem),
-        cross_products=fit.predictor.products(columns),
-    )
-    return max(_deviance(base, base) - _deviance(with_film, base), 0.0)
-
-
-# ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
 
 ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of the best cannot be excluded (derived)
@@ -185,7 +154,6 @@ class LikelihoodRatio:
     reason: Remark
     credible: bool = True
     inflation: float = 1.0
-    film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.likelihood_ratio`
     split: tuple[str, ...] = ()  #: parameters of the model that it splits by groups of trials
 
     @property
@@ -243,7 +211,6 @@ def likelihood_ratio(
         reason=compatible_with_none or reason,
         credible=not compatible_with_none and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
         inflation=ratio**2,
-        film_gain=film_gain(after),
     )
 
 
@@ -329,28 +296,13 @@ def _complexity(hypothesis: LikelihoodRatio) -> int:
 
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, Remark]]:
     """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words. A hypothesis is
-    excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best, both with the film mass
-    as stated and with the film mass free (`film_gain`). Returns members, rejected (reason by label; hypotheses excluded
-    by their likelihood alone are not listed).
+    excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best. Returns members,
+    rejected (reason by label; hypotheses excluded by their likelihood alone are not listed).
     """
     best = best_of(hypotheses)
-
-    film_alone = [-2 * ratio.fit.log_likelihood for ratio in hypotheses if ratio.names == (FILM,)]
-    film_free = {ratio.label: -2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses}
-    lowest_film_free = min(film_free.values())
-
-    def excess(hypothesis: LikelihoodRatio) -> float:
-        """Deviance above the best one's over its inflation, with the film mass as stated or free, the smaller."""
-        as_stated = hypothesis.deviance_excess(best)
-        # With the film mass free, the effect must still improve on a wrong film mass alone.
-        gain_over_film = film_alone[0] - film_free[hypothesis.label] if film_alone else math.inf
-        effect_needed = gain_over_film > ANSWER_SET_DELTA_CHI2 * best.inflation
-        with_film_free = film_free[hypothesis.label] - lowest_film_free if effect_needed else math.inf
-        return min(as_stated, with_film_free) / best.inflation
-
-    likely = [hypothesis for hypothesis in hypotheses if excess(hypothesis) <= ANSWER_SET_DELTA_CHI2]
+    reach = ANSWER_SET_DELTA_CHI2 * best.inflation
+    likely = [hypothesis for hypothesis in hypotheses if hypothesis.deviance_excess(best) <= reach]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
-
     # Sizes outside the plausible range are believed where no other hypothesis has plausible ones.
     credible = [ratio for ratio in likely if ratio.credible]
     plausible = [ratio for ratio in credible if ratio.plausible] or credible or likely
@@ -360,7 +312,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
         simpler = [
             other
             for other in plausible
-            if other.deviance_excess(ratio) <= ANSWER_SET_DELTA_CHI2 * best.inflation
+            if other.deviance_excess(ratio) <= reach
             and _complexity(other) < _complexity(ratio)
             and _contains(ratio, other)
         ]

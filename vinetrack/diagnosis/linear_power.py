@@ -43,7 +43,6 @@ from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
-from vinetrack.inference.systematics import systematics_of
 from vinetrack.planning.candidate_trials import at_solution, extended_fit
 
 # ------------------------------------------------------------------------------
@@ -98,8 +97,7 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
         sensitivities = effect_sensitivities(refit, [shape])
         if not sensitivities.shapes:
             return 1.0
-        systematics = systematics_of(refit.predictor, refit.solution)
-        scores = scores_of(refit, products_of(refit, sensitivities, systematics))
+        scores = scores_of(refit, products_of(refit, sensitivities))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)

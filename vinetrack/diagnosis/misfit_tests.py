@@ -33,7 +33,6 @@ from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residual
-from vinetrack.inference.systematics import SOURCES, Systematics, systematics_of
 
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
@@ -186,7 +185,6 @@ class MisfitTests:
     products: Products
     scores: Scores
     level: float
-    film: bool = False
 
     @cached_property
     def one_sided_z(self) -> Floats:
@@ -241,7 +239,7 @@ class MisfitTests:
         answers = effect_sensitivities(self.fit, _probe_shapes(self.fit))
         if not answers.shapes:
             return False
-        scores = scores_of(self.fit, products_of(self.fit, answers, _systematics(self.fit, self.film)))
+        scores = scores_of(self.fit, products_of(self.fit, answers))
         return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
 
     @property
@@ -291,15 +289,11 @@ class MisfitTests:
         return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}, True
 
 
-def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: bool = False) -> MisfitTests:
+def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
     """Test a fit for these candidates and for misfit that none of them describes."""
     effects = tuple(effect for effect in effects if effect.name not in fit.model)
     trials = [trial.trial for trial in fit.trials]
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
-    products = products_of(fit, sensitivities, _systematics(fit, film))
-    return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), level, film)
-
-
-def _systematics(fit: Fit, film: bool) -> Systematics:
-    return systematics_of(fit.predictor, fit.solution, [*SOURCES, "film"] if film else SOURCES)
+    products = products_of(fit, sensitivities)
+    return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), level)

@@ -39,7 +39,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effects_eliminated,
 )
 from vinetrack.inference.sensitivity import position_change
-from vinetrack.inference.systematics import Systematics
+from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
@@ -353,10 +353,11 @@ class Products:
         return all_products(self.columns[part], first, relative)
 
 
-def products_of(fit: Fit, sensitivities: EffectSensitivities, systematics: Systematics) -> Products:
+def products_of(fit: Fit, sensitivities: EffectSensitivities) -> Products:
     """Assemble the columns of a fit, of its systematic errors and of the candidates, which `sensitivities` lose: no
     trial's are held twice.
     """
+    systematics = systematics_of(fit.predictor, fit.solution)
     of_fit, problem = systematics.beside(fit.solution.columns), systematics.among(fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):

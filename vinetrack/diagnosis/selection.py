@@ -29,7 +29,6 @@ from vinetrack.diagnosis.candidate_fits import (
     with_curves,
 )
 from vinetrack.diagnosis.likelihood_ratio import (
-    ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
     LikelihoodRatio,
     answer_set,
@@ -205,25 +204,16 @@ def adequate_hypotheses(
     Returns adequate (the likeliest first; empty where every hypothesis is rejected), rejected (reason by label), after
     (tests of the model with the first adequate hypothesis added).
     """
-    in_answer_set, rejected = answer_set(hypotheses)
+    _, rejected = answer_set(hypotheses)
     best, by_likelihood = best_of(hypotheses), sorted(hypotheses, key=lambda ratio: -ratio.fit.log_likelihood)
-    within_reach = [
-        hypothesis
-        for hypothesis in by_likelihood
-        if hypothesis.label not in rejected
-        and (hypothesis in in_answer_set or hypothesis.deviance_excess(best) < OUT_OF_REACH)
-    ]
     adequate: list[LikelihoodRatio] = []
     after: MisfitTests | None = None
-    for hypothesis, film_free in [(each, film_free) for film_free in (False, True) for each in within_reach]:
-        # With the best, film of another mass is a set of two effects, unless an equally likely hypothesis is adequate
-        # with the film as stated.
-        only_best = hypothesis is best and not adequate
-        if film_free and (hypothesis in adequate or only_best or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
+    for hypothesis in by_likelihood:
+        if hypothesis.label in rejected or hypothesis.deviance_excess(best) >= OUT_OF_REACH:
             continue
         if hypothesis not in answer_set([*adequate, hypothesis])[0]:
             continue
-        tests = search.tests_after(hypothesis.fit, film=film_free) if hypothesis.credible else None
+        tests = search.tests_after(hypothesis.fit) if hypothesis.credible else None
         # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
         # first round, which rejects more readily.
         if tests is None:
@@ -235,8 +225,7 @@ def adequate_hypotheses(
         else:
             adequate.append(hypothesis)
             after = after or tests
-            rejected.pop(hypothesis.label, None)
-    return sorted(adequate, key=lambda ratio: -ratio.fit.log_likelihood), rejected, after
+    return adequate, rejected, after
 
 
 # ------------------------------------------------------------------------------

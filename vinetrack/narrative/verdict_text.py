@@ -32,7 +32,6 @@ from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
-from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative import sentence
 
 if TYPE_CHECKING:
@@ -417,7 +416,7 @@ def explain(step: SelectionStep) -> str:
     best = answers[0]
     facts: dict[str, Any] = {"name": best.names[0] if step.note else best.names[-1], "model": model, "trials": trials}
     facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
-    facts |= {"hypotheses": _hypotheses(answers), "by_film": _by_film(answers)}
+    facts |= {"hypotheses": _hypotheses(answers)}
     text = sentence(_EXPLAINED[verdict], facts)
     if step.note:
         note = str(step.note)
@@ -458,18 +457,6 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
     return "".join(
         f" {name} has the size that results if {slip}: check that first." for slip, name in effect_of_slip.items()
     )
-
-
-def _by_film(answers: Sequence[LikelihoodRatio]) -> str:
-    """Name the hypotheses that are in the answer set only if the film's mass is off; blank where none is."""
-    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, best_of
-
-    best = best_of(answers)
-    only_by_film = [ratio for ratio in answers if ratio.deviance_excess(best) > ANSWER_SET_DELTA_CHI2 * best.inflation]
-    if not only_by_film:
-        return ""
-    names = joined([ratio.label.replace("+", " with ") for ratio in only_by_film])
-    return sentence("only_by_film", {"names": names, "error": FILM_ERROR})
 
 
 def _with_the_fault(step: SelectionStep) -> str:
