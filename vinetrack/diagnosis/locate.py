@@ -40,7 +40,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.errors import robust_variances
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,7 +188,6 @@ def _residual_along_growth(courses: Sequence[ResidualCourse], scatter: Scatter) 
 FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called significant where nothing drifts (chosen)
 FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)
 LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
-HALVES = (0.25, 0.75)  # Midpoints of the halves of the growth, as fractions of it (defined)
 
 # Conditions on which a parameter should not depend, as fields of a trial
 COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
@@ -220,14 +219,13 @@ class Drift:
 
 
 def drift(fit: Fit) -> Drift:
-    """Test B for drift with pressure, payload, angle, chamber, inlet or along the growth, and P_y against the sheet."""
+    """Test B for drift with pressure, payload, angle, chamber or inlet, and P_y against the sheet."""
     import pandas as pd
 
     tests = list(against_the_sheet(fit))
     if DAMPING in fit.predictor.layout.keys:
         estimates = per_trial_estimates(fit, align_trials(fit))
-        of_B = [test for against in COVARIATES for test in _against(estimates, against)]
-        tests = [*of_B, *_along_growth(estimates), *tests]
+        tests = [*(test for against in COVARIATES for test in _against(estimates, against)), *tests]
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     table = pd.DataFrame(tests, columns=[*DRIFT_COLUMNS, "p", "groups"]).sort_values(
         "p", kind="stable", ignore_index=True
@@ -281,15 +279,6 @@ def _tested(
     return row | {"sentence": sentence, "p": min(1.0, len(p) * min(p)), "groups": groups}
 
 
-def _group(subject: Row, level: float, base: float, deviation: float, sigma: float, n_trials: int) -> Row:
-    """A row of the table of groups: B and its ratio to the common value `base`, each with its standard error, from the
-    deviation of ln B and its standard error.
-    """
-    ratio = math.exp(deviation)
-    numbers = (level, base * ratio, base * ratio * sigma, ratio, ratio * sigma, n_trials)
-    return subject | dict(zip(GROUP_COLUMNS[len(subject) :], numbers, strict=True))
-
-
 # ------------------------------------------------------------------------------
 # B of each trial, with all other parameters at their common values.
 
@@ -300,8 +289,7 @@ MAX_DEVIATION = 3.0  # Largest deviation of ln B from the common value (chosen)
 class PerTrialEstimates:
     """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `vines` are blank where all have one B;
     `base` is the common value, `deviation` that of the best ln B of the trial from it, NaN where a trial does not
-    depend on it; `variance` is that from a typical scatter of pressure and B, up to a factor. `halves`, shape
-    (n_trials, 2), are the best deviations in each half of the growth, NaN where they are not known.
+    depend on it; `variance` is that from a typical scatter of pressure and B, up to a factor.
     """
 
     number: Number
@@ -311,7 +299,6 @@ class PerTrialEstimates:
     base: Floats
     deviation: Floats
     variance: Floats
-    halves: Floats
 
 
 def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
@@ -331,7 +318,7 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         of_B = trial_effects[:, DAMPING_DEVIATION]
         trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
         columns = tuple(predictor.linearise(np.empty(0), trial_effects))
-    response, variance, halves = np.empty(len(data)), np.empty(len(data)), np.full((len(data), 2), math.nan)
+    response, variance = np.empty(len(data)), np.empty(len(data))
     for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
         sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])
         response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
@@ -340,17 +327,6 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
         scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
         variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
-        # ln B in each half of the growth, linearised about the trial's own: about the common one, the between-trial
-        # scatter would enter in second order. What B does in the first half is carried through the second as a shift
-        # in time, as where inertia is small.
-        growth_m = data[i].lead_position_m - of_trial[:, -1] - trial_effects[i, ORIGIN]
-        first, speed = of_trial[:, DAMPING_DEVIATION].copy(), -of_trial[:, RELEASE]
-        middle = int(np.argmax(growth_m >= 0.5 * growth_m.max()))
-        if speed[middle] > 0 and first[middle] != 0:
-            first[middle:] = first[middle] * speed[middle:] / speed[middle]
-            design = np.column_stack([first, of_trial[:, DAMPING_DEVIATION] - first, of_trial[:, others]])
-            change = np.linalg.lstsq(design, of_trial[:, -1], rcond=1e-9)[0][:2]
-            halves[i] = trial_effects[i, DAMPING_DEVIATION] + change
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
     known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
     number, trials = next(each for each in fit.numbers if each.key == DAMPING), tuple(each.trial for each in data)
@@ -362,7 +338,6 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         base=predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
         deviation=np.where(known, trial_effects[:, DAMPING_DEVIATION], np.nan),
         variance=variance,
-        halves=halves,
     )
 
 
@@ -387,7 +362,7 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
         w, block, level = weight[chosen], vines[chosen], levels[chosen]
         x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
         n_vines = np.unique(block).size
-        steady = _steady_change(x, d, w, replicates, n_vines, LEAST_SCATTER**2)
+        steady = _steady_change(x, d, w, replicates, n_vines)
         if steady is None:
             continue
         slope, sigma, p, variance, dof = steady
@@ -401,15 +376,18 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
             k = np.flatnonzero(chosen & (levels == value))
             bases, error = estimates.base[k], math.sqrt(variance / float(np.sum(weight[k])))
             base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
-            mean = float(np.average(estimates.deviation[k], weights=weight[k]))
-            groups.append(_group(subject, value, base, mean, error, k.size))
+            ratio = math.exp(float(np.average(estimates.deviation[k], weights=weight[k])))
+            numbers = (value, base * ratio, base * ratio * error, ratio, ratio * error, k.size)
+            groups.append(subject | dict(zip(GROUP_COLUMNS[len(subject) :], numbers, strict=True)))
         reach, ends = float(np.ptp(coordinate[chosen])), (float(level.min()), float(level.max()))
-        change = _relative(slope * reach, sigma * reach)
+        # Relative change from the smaller value, with its standard error
+        larger = math.exp(abs(slope) * reach)
+        change = larger - 1, larger * sigma * reach
         yield _tested(subject, ends if slope >= 0 else ends[::-1], change, (p, p_constancy), dof, d.size, groups)
 
 
 def _steady_change(
-    x: Floats, d: Floats, weight: Floats, replicates: tuple[float, int], n_means: int, least: float
+    x: Floats, d: Floats, weight: Floats, replicates: tuple[float, int], n_means: int
 ) -> tuple[float, float, float, float, int] | None:
     """Slope of values about `n_means` means, its standard error and p-value (Student's t), and the variance of the
     values, relative to 1/weight, with its degrees of freedom: that of replicates, or about the slope, and at least
@@ -425,14 +403,9 @@ def _steady_change(
     slope = float(np.sum(weight * x * d)) / square
     if replicates[1] < FEWEST_DEGREES:
         variance = float(np.sum(weight * (d - x * slope) ** 2)) / dof
-    variance = max(variance, least)
+    variance = max(variance, LEAST_SCATTER**2)
     sigma = math.sqrt(variance / square)
     return slope, sigma, float(2 * student.sf(abs(slope) / sigma, dof)), variance, dof
-
-
-def _relative(rise: float, sigma: float) -> tuple[float, float]:
-    """Relative change from the smaller value that a change of its logarithm is, with its standard error."""
-    return math.expm1(abs(rise)), math.exp(abs(rise)) * sigma
 
 
 def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
@@ -447,33 +420,6 @@ def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_])
     dof = int(np.count_nonzero(known)) - np.unique(conditions[known]).size
     apart = _centred(values[known], weight[known], conditions[known])
     return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
-
-
-def _along_growth(estimates: PerTrialEstimates) -> Iterator[Row]:
-    """Test ln B for a change along the growth, for every vine and for all: the mean difference of the halves, each
-    fitted by itself. The scatter of pressure and B between trials is the same in both halves and cancels. An effect
-    that builds up along the growth shows here even where n and the yield pressure absorb it in every comparison between
-    trials. The groups of a vine are its halves, which share the variance of their difference.
-    """
-    halves, vines = estimates.halves, estimates.vines
-    usable = (np.abs(halves) <= MAX_DEVIATION).all(axis=1)
-    names = list(dict.fromkeys(vines[usable].tolist()))
-    for vine in [*names, *([""] if len(names) > 1 else [])]:
-        chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
-        rise, ones = halves[chosen, 1] - halves[chosen, 0], np.ones(chosen.size)
-        replicates = _of_replicates(rise, ones, estimates.conditions[chosen])
-        # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
-        steady = _steady_change(ones, rise, ones, replicates, 0, 2e-3**2)
-        if steady is None:
-            continue
-        mean, sigma, p, _, dof = steady
-        subject, base = _subject(estimates.number, vine, "growth"), float(estimates.base[chosen[0]])
-        groups = [
-            _group(subject, level, base, half, sigma / math.sqrt(2), rise.size)
-            for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True)
-        ]
-        ends, shown = HALVES if mean >= 0 else HALVES[::-1], groups if vine or len(names) == 1 else ()
-        yield _tested(subject, ends, _relative(mean, sigma), (p,), dof, rise.size, shown)
 
 
 def against_the_sheet(fit: Fit) -> Iterator[Row]:

@@ -460,8 +460,6 @@ def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: flo
     facts = {**row, "who": who, "amount": f"{change:.{digits}f} ± {error:.{digits}f} %"}
     if against == "sheet":
         return sentence("drifts_from_sheet", facts | {"sigma_Pa": stated_sigma_Pa})
-    if against == "growth":
-        return sentence("drifts_along_growth", facts | {"later": stop > start})
     name, unit, times = drift_condition(against)
     low, high = (start, stop) if steady else sorted((start, stop))
     facts |= {"name": name, "low": f"{low * times:.3g} {unit}", "high": f"{high * times:.3g} {unit}"}
