@@ -66,6 +66,10 @@ if TYPE_CHECKING:
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
+# Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
+# (chosen)
+PARTIAL_SHARE = 0.5
+
 Names = frozenset[str]
 
 
@@ -78,8 +82,6 @@ class EffectSets:
         self.fitted: dict[Names, LikelihoodRatio] = {}
         for single in singles:
             self._keep_best(single)
-        self.extended: set[Names] = set()
-        self.left_out: set[tuple[str, str]] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
         """Fitted sets of this many effects, the highest likelihood first."""
@@ -87,25 +89,17 @@ class EffectSets:
         return sorted(of_size, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
-        """Forward step: fit sets of this many effects, built on the best sets of one fewer."""
+        """Fit sets of this many effects, built on the best sets of one fewer."""
         n_partners = 3  # partners tried with each base (chosen)
-        for base in self._bases(size - 1):
-            names = frozenset(base.names)
-            if names in self.extended:
+        # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
+        bases = self.of_size(size - 1)[: 3 if size == 2 else 2]
+        for base in bases:
+            if base.delta_chi2 < MIN_SHARE_OF_BEST_GAIN * bases[0].delta_chi2:
                 continue
-            self.extended.add(names)
             search = CandidateFits(self.search.tests_after(base.fit), self.search.report)
             for partner in search.fit(n_partners):
                 self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
         return self.of_size(size)
-
-    def _bases(self, size: int) -> list[LikelihoodRatio]:
-        """Sets of this many effects on which larger ones are built."""
-        of_size = self.of_size(size)
-        best_gain = max((hypothesis.delta_chi2 for hypothesis in of_size), default=0.0)
-        # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
-        best = of_size[: 3 if size == 1 else 2]
-        return [hypothesis for hypothesis in best if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * best_gain]
 
     def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
         """Fit a set without one of its members, from where the set ended; None where no fit succeeds. A fit of the
@@ -113,10 +107,8 @@ class EffectSets:
         the better of the two counts.
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
-        if (hypothesis.label, effect.name) not in self.left_out:
-            self.left_out.add((hypothesis.label, effect.name))
-            self.search.report(f"taking out {effect.name}")
-            self._refit(hypothesis.fit, others)
+        self.search.report(f"taking out {effect.name}")
+        self._refit(hypothesis.fit, others)
         return self.fitted.get(frozenset(other.name for other in others))
 
     def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
@@ -154,9 +146,9 @@ class EffectSets:
         added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
         return _worth(hypothesis, smaller, added) >= max(family.threshold(effect.name) for effect in added)
 
-    def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
-        """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.
-        Returns empty where no single effect is plausible.
+    def partial_steps(self) -> tuple[LikelihoodRatio, ...]:
+        """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant;
+        empty where they remove little of the misfit.
         """
         best: LikelihoodRatio | None = None
         for size in range(1, MAX_EFFECTS + 1):
@@ -164,7 +156,7 @@ class EffectSets:
             if not plausible or (best is not None and not self.is_better(plausible[0], best)):
                 break
             best = plausible[0]
-        if best is None:
+        if best is None or best.fit.chi2_per_dof - 1 >= (1 - PARTIAL_SHARE) * (self.before.chi2_per_dof - 1):
             return ()
         steps = [self.subset(best, best.effects[: k + 1]) for k in range(len(best.effects))]
         return tuple(step for step in steps if step is not None)
@@ -383,11 +375,6 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     return likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
-# Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
-# (chosen)
-PARTIAL_SHARE = 0.5
-
-
 @dataclass(frozen=True)
 class SelectionStep:
     """One round of the selection: a model, its tests, and the hypotheses compared. `answer_set` holds the hypotheses
@@ -508,9 +495,13 @@ def _effect_set_rounds(
             break
         best_so_far = of_this_size[0]
     fitted = tuple(sets.fitted.values())
-    reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
-    steps = _partial_steps(tests, sets)
-    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, rejected=reasons, partial=steps)]
+    # Of the best hypothesis of each size, why it is no explanation
+    reasons = {
+        best.label: rejected.get(best.label, MISFIT_REMAINS) if best.credible else best.reason
+        for best in (*singles[:1], *sets.of_size(2)[:1], best_so_far)
+    }
+    steps = sets.partial_steps()
+    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, rejected=tuple(reasons.items()), partial=steps)]
 
 
 def _rounds(
@@ -582,22 +573,3 @@ def _remainder(tests: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[
     names = {effect.name for effect in added}
     remaining = [effect for effect in hypothesis.effects if effect.name not in names]
     return likelihood_ratio(tests.fit, remaining, hypothesis.fit)
-
-
-def _partial_steps(tests: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRatio, ...]:
-    """Steps of plausible size that remove most of the misfit; empty where they remove little."""
-    steps = sets.plausible_steps()
-    excess = tests.fit.chi2_per_dof - 1
-    removes_most = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - PARTIAL_SHARE) * excess
-    return steps if removes_most else ()
-
-
-def _rejection_reasons(
-    best_of_size: Sequence[LikelihoodRatio], rejected: dict[str, Remark]
-) -> tuple[tuple[str, Remark], ...]:
-    """Label of the best hypothesis of each size, and why it is no explanation."""
-    reasons = {
-        hypothesis.label: rejected.get(hypothesis.label, MISFIT_REMAINS) if hypothesis.credible else hypothesis.reason
-        for hypothesis in best_of_size
-    }
-    return tuple(reasons.items())
