@@ -11,6 +11,7 @@ from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
+from vinetrack.diagnosis.force_laws import FORMS
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
 from vinetrack.narrative import templates
@@ -38,7 +39,9 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code():
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= templates().keys() | REMARKS.keys()
     assert [code for code in REMARKS if not re.search(rf"""["']{code}["']""", source)] == []
     source += "".join(path.read_text(encoding="utf-8") for path in (PACKAGE / "narrative").glob("*_text.py"))
-    assert [code for code in templates() if not re.search(rf"""["']{code}["']""", source)] == []
+    laws = {f"law_{kind}" for kind in FORMS}
+    assert [code for code in templates() if code not in laws and not re.search(rf"""["']{code}["']""", source)] == []
+    assert laws <= templates().keys()
 
 
 def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:

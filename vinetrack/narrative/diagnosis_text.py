@@ -372,53 +372,25 @@ def diagnosis_page(diagnosis: Diagnosis) -> str:
 # ------------------------------------------------------------------------------
 # Simple laws of a missing force.
 
-# Form of a force, and where along the motions it has the stated size
-_LAWS = {
-    "constant": ("a constant force of {size}", ""),
-    "position": ("a force in proportion to the tail's travel x", "{size} at the end"),
-    "speed": ("a force in proportion to the speed ẋ", "{size} at the highest"),
-    "speed_squared": ("a force in proportion to ẋ²", "{size} at the highest speed"),
-    "position_squared": ("a force in proportion to x²", "{size} at the end"),
-    "beyond_a_place": ("a force that rises in proportion to the growth beyond {milli} mm", "{size} at the end"),
-    "speed_cubed": ("a force in proportion to ẋ³", "{size} at the highest speed"),
-    "beyond_a_speed": ("a force in proportion to the excess of ẋ over {scale} m/s", "{size} at the highest speed"),
-    "squared_beyond_a_speed": (
-        "a force in proportion to the square of the excess of ẋ over {scale} m/s",
-        "{size} at the highest speed",
-    ),
-    "pressure": ("a force in proportion to the pressure", "{size} at the highest"),
-    "time": ("a force that grows in proportion to time", "{size} at the end of the longest trial"),
-    "inverse_speed": ("a force that falls with speed as 1/ẋ", "{size} at {scale} m/s and below"),
-    "falling_with_speed": (
-        "a force that falls with speed",
-        "{size} at the lowest speed, by a factor of e every {scale} m/s of ẋ",
-    ),
-    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {milli} ms"),
-    "fading_along": (
-        "a force that decays along the growth",
-        "{size} at the start, by a factor of e every {milli} mm",
-    ),
-    "patch": ("a force that acts between {low} and {high} mm of growth, {size}", ""),
-    "periodic": ("a force that repeats every {milli} mm of growth, {size}", ""),
-}
-
 
 def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
-    """Describe a law of force with its size."""
+    """Describe a law of force with its size, and where along the motions it has this size."""
     if law.kind == "periodic":
         size = f"with an amplitude of {_force_text(math.hypot(*amplitude_N), sigma_N)}"
     else:
         size = f"{'+' if amplitude_N[0] > 0 else ''}{_force_text(amplitude_N[0], sigma_N)}".replace("-", "−")
-    form, place = _LAWS[law.kind]
-    if law.factor:
-        by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}[law.factor]
-        form, place = f"{form}, times {by}", "{size} at its largest"
+    by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
     scale = law.shapes[0] if law.shapes else math.nan
-    ends = {"low": f"{1e3 * max(scale, 0.0):.0f}", "high": f"{1e3 * sum(law.shapes):.0f}"}
-    text = (f"{form}, {place}" if place else form).format(
-        size=size, milli=number(1e3 * scale), scale=f"{scale:.2g}", **ends
-    )
-    return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
+    facts = {
+        "size": size,
+        "times": f", times {by[law.factor]}" if law.factor else "",
+        "area": ", in proportion to the cross-section of the vine" if law.reference_area_m2 else "",
+        "milli": number(1e3 * scale),
+        "scale": f"{scale:.2g}",
+        "low": f"{1e3 * max(scale, 0.0):.0f}",
+        "high": f"{1e3 * sum(law.shapes):.0f}",
+    }
+    return sentence(f"law_{law.kind}", facts)
 
 
 def _force_text(value_N: float, sigma_N: float) -> str:
