@@ -58,7 +58,6 @@ class Failure:
     pressure_unit: str
     by_condition: pd.DataFrame
     along_position: pd.DataFrame
-    scatter: Scatter
     drift: Drift
 
     @property
@@ -102,7 +101,6 @@ def locate(fit: Fit) -> Failure:
         pressure_unit=predicted[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_position=_residual_along_growth(courses, scatter),
-        scatter=scatter,
         drift=drift(fit),
     )
 

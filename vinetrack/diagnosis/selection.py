@@ -167,9 +167,7 @@ class EffectSets:
         known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
             self.fitted[names] = hypothesis
-            of_size = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
-            drop_curves(of_size)
-            self.fitted |= of_size
+            drop_curves(self.fitted)
 
 
 def _worth(larger: LikelihoodRatio, smaller: LikelihoodRatio, added: Sequence[Effect]) -> float:
