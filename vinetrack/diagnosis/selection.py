@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.candidate_fits import (
     MIN_SHARE_OF_BEST_GAIN,
@@ -234,36 +233,29 @@ TWO_SIDED_95 = 1.959964  # Derived: quantile of the normal distribution
 
 
 def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
-    """Find, for each size of the added effects, the physical effects that it may include. Returns for each size, those
-    that could shift it by more than its standard error, the largest first.
+    """Find, for each size of the added effects, the physical effects that it may include, each in the shape that shifts
+    it most. Returns for each size, those that could shift it by more than its standard error, the largest first.
     """
-    if not after.sensitivities.shapes:
-        return ()
-    levers = levers_of(after.fit, after.products)
-    chosen = []
-    for number, lever in zip(after.fit.numbers, levers, strict=True):
-        if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
-            by_shift = sorted(_of_number(after, number, lever), key=lambda found: -found[0])
-            # 1.0: shift, in standard errors of the size, from which a confounder is reported (chosen)
-            # 3: confounders listed for each size (chosen)
-            chosen += [confounder for shift, confounder in by_shift if shift > 1.0 * number.sigma][:3]
-    return tuple(chosen)
-
-
-def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[tuple[float, Confounder]]:
-    """Every physical effect as a confounder of one size, in the shape that shifts the size most, with the shift."""
-    largest: dict[str, tuple[float, Confounder]] = {}
-    for k, shape in enumerate(after.sensitivities.shapes):
-        # An effect that contains the added one as a limit is an alternative to it, no confounder.
-        effect, sigma = shape.effect, float(after.scores.sigma[k])
-        alternative = effect.kind != "physical" or number.key.split(".")[0] in effect.replaces
-        if alternative or not effect.parameters or shape.whole or not math.isfinite(sigma):
+    shapes, chosen = after.sensitivities.shapes, list[Confounder]()
+    levers = levers_of(after.fit, after.products) if shapes else ()
+    for number, lever in zip(after.fit.numbers, levers, strict=False):
+        name = number.key.split(".")[0]
+        if name not in added or not 0 < number.sigma < math.inf:
             continue
-        confounder = _in_shape(number, shape, float(after.scores.size[k]), sigma, float(lever[k]))
-        shift = abs(confounder.value - number.value)
-        if effect.name not in largest or shift > largest[effect.name][0]:
-            largest[effect.name] = shift, confounder
-    return list(largest.values())
+        largest: dict[str, tuple[float, Confounder]] = {}
+        for k, shape in enumerate(shapes):
+            # An effect that contains the added one as a limit is an alternative to it, no confounder.
+            effect, sigma = shape.effect, float(after.scores.sigma[k])
+            alternative = effect.kind != "physical" or name in effect.replaces
+            if not alternative and effect.parameters and not shape.whole and math.isfinite(sigma):
+                found = _in_shape(number, shape, float(after.scores.size[k]), sigma, float(lever[k]))
+                shift = abs(found.value - number.value)
+                # A shift of less than a standard error of the size is not reported (chosen)
+                if shift > largest.get(effect.name, (number.sigma, None))[0]:
+                    largest[effect.name] = shift, found
+        # 3: confounders listed for each size (chosen)
+        chosen += [found for _, found in sorted(largest.values(), key=lambda found: -found[0])[:3]]
+    return tuple(chosen)
 
 
 def _in_shape(number: Number, shape: CandidateShape, size: float, sigma: float, lever: float) -> Confounder:
