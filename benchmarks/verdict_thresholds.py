@@ -35,7 +35,7 @@ import vinetrack.diagnosis
 
 THRESHOLDS = (
     *("FALSE_ALARM_LEVEL_FIRST_ROUND", "FALSE_ALARM_LEVEL_LATER_ROUNDS", "PROBE_LEVEL", "FAR_OFF_CHI2_PER_DOF"),
-    *("MISSED_FRACTION", "MISSED_FRACTION_WITHOUT_SLOW_ERRORS", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS"),
+    *("MISSED_FRACTION", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS"),
     *(
         "TESTABLE_SIGMAS",
         "CAREFUL_PRESSURE_SCATTER",
@@ -44,7 +44,7 @@ THRESHOLDS = (
         "OUT_OF_REACH",
     ),
     *("CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS", "PARTIAL_SHARE", "MIN_LINEAR_GAIN"),
-    *("SYSTEMATICS_CHECK_P_VALUE", "CONTRADICTING_DRIFT_SIGMAS", "FALSE_ALARM_LEVEL"),
+    *("CONTRADICTING_DRIFT_SIGMAS", "FALSE_ALARM_LEVEL"),
 )
 """Numbers of `vinetrack.diagnosis` that decide between one verdict and another. Those that only bound the time of a
 search, or the words of a sentence, are not among them."""

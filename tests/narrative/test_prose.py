@@ -50,7 +50,7 @@ def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPowe
 
 
 POWER = Power(
-    n_trials=6, threshold=4.0, false_alarm_rate=0.0042,
+    n_trials=6, false_alarm_rate=0.0042,
     effects=(effect("fold_inertia", "η", 0.7, 1.0), effect("air_drag", "C_D", 150.0, 3.0)),
     not_testable={"payload_drag": remark("column_blank", column="payload_g")}, model=("gravity", "eversion_damping"),
     numbers=(NumberWidth("n", "", 0.37, 0.0075), NumberWidth("B", "tube", 6.4, 0.034)),

@@ -161,7 +161,6 @@ def power_of(
     powers = [_effect_power(tests, effect, start, *known) for effect in asked]
     return Power(
         n_trials=len(tests.fit.trials),
-        threshold=tests.family.single_shape_threshold,
         false_alarm_rate=_false_alarm_rate(tests.fit),
         effects=tuple(power for power in powers if power is not None),
         not_testable={**(not_testable or {}), **dict.fromkeys(tests.sensitivities.silent, remark("no_response"))},

@@ -176,12 +176,10 @@ StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSeriali
 @dataclass(frozen=True)
 class Power(JsonRecord):
     """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
-    `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. The probability of
-    any false alarm is at most `false_alarm_rate`.
+    The probability of any false alarm is at most `false_alarm_rate`.
     """
 
     n_trials: int = 0
-    threshold: Annotated[OrNaN, Field(alias="threshold_sigma")] = math.nan
     false_alarm_rate: OrNaN = math.nan
     effects: tuple[EffectPower, ...] = ()
     not_testable: Annotated[Mapping[str, StoredRemark], Field(alias="not_testable_codes")] = field(default_factory=dict)

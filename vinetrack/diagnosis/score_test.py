@@ -490,12 +490,9 @@ def levers_of(fit: Fit, products: Products) -> Floats:
     parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs in units of the parameter over those of
     the size. Shape (n_numbers, n_shapes).
     """
-    free = fit.predictor.layout.free
-    derivatives = [
-        number.value if parameter.logarithmic else parameter.scale
-        for parameter, number in zip(free, fit.numbers, strict=True)
-    ]
-    return np.asarray(projected(fit, products, fit.state).lever[: len(free)] * np.array(derivatives)[:, None])
+    free = zip(fit.predictor.layout.free, fit.numbers, strict=True)
+    derivatives = np.array([parameter.derivative(number.value) for parameter, number in free])
+    return np.asarray(projected(fit, products, fit.state).lever[: derivatives.size] * derivatives[:, None])
 
 
 def scores_of(fit: Fit, products: Products) -> Scores:
