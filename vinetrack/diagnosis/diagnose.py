@@ -262,11 +262,7 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Di
     if UNEXPLAINED in (result.verdict, result.final_verdict):
         report("computing the missing force")
         result = _or_note(result, "no_missing_force", partial(_with_missing_force, result))
-    return with_next_experiment(result, limits, report)
-
-
-def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report: Report = _quiet) -> Diagnosis:
-    """Add the trials that would discriminate between the hypotheses that remain."""
+    # The trials that would discriminate between the hypotheses that remain
     last = result.rounds[-1]
     tied = list(last.fits.values())
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:

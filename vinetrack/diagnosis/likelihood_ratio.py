@@ -167,6 +167,11 @@ class LikelihoodRatio:
         return "+".join(self.names)
 
     @property
+    def n_parameters(self) -> int:
+        """Number of parameters of its effects."""
+        return sum(len(effect.parameters) for effect in self.effects)
+
+    @property
     def numbers(self) -> tuple[Number, ...]:
         """Fitted sizes of its effects, without those that no trajectory depends on."""
         return tuple(number for number in self.fit.numbers if self._adds(number) and math.isfinite(number.sigma))
@@ -289,11 +294,6 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     return math.sqrt(max([1.0, *ratios]))
 
 
-def _complexity(hypothesis: LikelihoodRatio) -> int:
-    """Number of parameters of its effects."""
-    return sum(len(effect.parameters) for effect in hypothesis.effects)
-
-
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, Remark]]:
     """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words. A hypothesis is
     excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best. Returns members,
@@ -309,21 +309,16 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     rejected = {ratio.label: ratio.reason for ratio in likely if ratio not in plausible}
     members = []
     for ratio in plausible:
+        limits = {name for effect in ratio.effects for name in effect.replaces}
         simpler = [
             other
             for other in plausible
-            if other.deviance_excess(ratio) <= reach
-            and _complexity(other) < _complexity(ratio)
-            and _contains(ratio, other)
+            if limits & set(other.names)
+            and other.n_parameters < ratio.n_parameters
+            and other.deviance_excess(ratio) <= reach
         ]
         if simpler:
             rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
         else:
             members.append(ratio)
     return members, rejected
-
-
-def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
-    """Whether an effect of one declares that it contains an effect of the other (`replaces`)."""
-    replaced = {name for effect in hypothesis.effects for name in effect.replaces}
-    return bool(replaced & set(other.names))
