@@ -389,72 +389,52 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     report("testing the model")
     tests = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
     trial_differences = differences(fit)
-    significant_differences = significant(trial_differences, FALSE_ALARM_LEVEL_FIRST_ROUND)
-    stated_difference = any(difference.stated for difference in significant_differences)
-    if not tests.rejects_model and not tests.needs_search and not stated_difference:
-        unstated = tuple(between_fits(fit, significant_differences, 0.0, report))
-        return [SelectionStep(ADEQUATE, tests, unstated_differences=unstated)]
+    differing = significant(trial_differences, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    nothing_rejects = not tests.rejects_model and not any(difference.stated for difference in differing)
+    if nothing_rejects and not tests.needs_search:
+        return [SelectionStep(ADEQUATE, tests, unstated_differences=tuple(between_fits(fit, differing, 0.0, report)))]
 
     # The most promising single effects, a tail that may go slack, and differences between trials.
     search = CandidateFits(tests, report)
     slack = slack_fit(fit, report) if tests.rejects_model else None
     alone = [] if slack is None else [slack]
-    hypotheses = [*search.fit(), *alone]
-    best_gain = max((hypothesis.delta_chi2 for hypothesis in hypotheses), default=0.0)
+    best_gain = max((hypothesis.delta_chi2 for hypothesis in (*search.fit(), *alone)), default=0.0)
     between = between_fits(fit, trial_differences, best_gain, report)
-    unstated_names = {difference.name for difference in significant_differences if not difference.stated}
+    unstated_names = {difference.name for difference in differing if not difference.stated}
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
     alone += between
-    hypotheses += between
-    only_suspected = not tests.rejects_model and not stated_difference
-    if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
-        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
+
+    def nothing_found(verdict: str = ADEQUATE) -> list[SelectionStep]:
+        differ = unstated if verdict == ADEQUATE else ()
+        return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=differ)]
+
+    def is_significant(hypothesis: LikelihoodRatio) -> bool:
+        return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
+
     # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
-    # from it.
+    # from it. Nothing is left to gain once the residuals of the best are no larger than the errors of the tracks and
+    # trials scatter no more than careful work allows.
     for every in (False, True):
         hypotheses = [*search.fit(all_of_them=every), *alone]
-        rounds = _single_effect_rounds(tests, search, hypotheses) if every or not _may_be_improved(hypotheses) else None
-        if rounds is not None:
-            return rounds
+        best = best_of(hypotheses) if hypotheses else None
+        if not every and nothing_rejects and (best is None or best.sigma < SEARCH_SIGMAS):
+            return nothing_found()
+        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(best.fit))):
+            continue
+        if is_significant(best):
+            adequate, rejected, after = adequate_hypotheses(hypotheses, search)
+            if after is not None:
+                return _rounds(tests, EffectSets(search, hypotheses), adequate, rejected, after)
     if not tests.rejects_model and not tests.needs_search:
-        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
+        return nothing_found()
 
     # Sets of effects.
     hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in alone]
     credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
-    if not credible or not _exceeds_threshold(best_of(credible), tests):
+    if not credible or not is_significant(best_of(credible)):
         # A score that no refit confirms counts only if another test rejects the model too.
-        rejected = tests.omnibus_rejects or tests.exceeds_slow_errors
-        verdict = UNEXPLAINED if rejected else ADEQUATE
-        unstated = unstated if verdict == ADEQUATE else ()
-        return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=unstated)]
+        return nothing_found(UNEXPLAINED if tests.omnibus_rejects or tests.exceeds_slow_errors else ADEQUATE)
     return _effect_set_rounds(tests, search, hypotheses)
-
-
-def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
-    """Whether a better hypothesis may exist: the best one so far is far off, or its trial effects absorb a misfit.
-    Nothing is left to gain once the residuals are no larger than the errors of the tracks and trials scatter no more
-    than careful work allows.
-    """
-    if not hypotheses:
-        return True
-    best = best_of(hypotheses).fit
-    return exceeds_slow_errors(best) or has_excess_scatter(best)
-
-
-def _exceeds_threshold(hypothesis: LikelihoodRatio, tests: MisfitTests) -> bool:
-    """Whether the significance of a hypothesis reaches the family-wise threshold of its effect."""
-    return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
-
-
-def _single_effect_rounds(
-    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
-) -> list[SelectionStep] | None:
-    """Rounds in which a single effect explains the misfit; None where none does."""
-    if not hypotheses or not _exceeds_threshold(best_of(hypotheses), tests):
-        return None
-    adequate, rejected, after = adequate_hypotheses(hypotheses, search)
-    return None if after is None else _rounds(tests, EffectSets(search, hypotheses), adequate, rejected, after)
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
