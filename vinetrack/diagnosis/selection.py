@@ -501,45 +501,29 @@ def _rounds(
     round_tests, alternatives = tests, tuple(adequate)
     for name in common if len(adequate) > 1 else common[:-1]:
         verdict = ARTEFACT if kinds[name] == "measurement" else MISSING
-        steps.append(_shared_step(verdict, round_tests, sets, best, added, name, reasons))
+        remaining = sorted((one for one in best.effects if one not in added), key=lambda one: one.name != name)
+        together = likelihood_ratio(round_tests.fit, remaining, best.fit)
+        note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
+        subset = sets.subset(best, (*added, remaining[0])) if added or verdict == MISSING else None
+        if added:
+            alone = [] if subset is None else [likelihood_ratio(round_tests.fit, remaining[:1], subset.fit)]
+            fitted, reasons = (*alone, together), ()
+        steps.append(SelectionStep(verdict, round_tests, (together,), fitted, reasons, (name,), note))
         if verdict == ARTEFACT:
             return steps
-        added = (*added, next(effect for effect in best.effects if effect.name == name))
-        subset = sets.subset(best, added)
+        added = (*added, remaining[0])
         round_tests = sets.search.tests_after(subset.fit if subset else best.fit)
     if added:
-        alternatives = tuple(_remainder(round_tests, hypothesis, added) for hypothesis in adequate)
+        # What each set adds to the effects that are in the model already
+        names_added = {effect.name for effect in added}
+        remainders = ([one for one in ratio.effects if one.name not in names_added] for ratio in adequate)
+        alternatives = tuple(
+            likelihood_ratio(round_tests.fit, remainder, ratio.fit)
+            for ratio, remainder in zip(adequate, remainders, strict=True)
+        )
         fitted, reasons = alternatives, ()
     verdict = verdict_of(alternatives)
     names = tuple(sorted(dict.fromkeys(name for hypothesis in alternatives for name in hypothesis.names), key=order))
     confounded = confounders_of(after, best.names) if verdict == MISSING else ()
     last = SelectionStep(verdict, round_tests, alternatives, fitted, reasons, names, confounded=confounded)
     return [*steps, last, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [*steps, last]
-
-
-def _shared_step(
-    verdict: str,
-    tests: MisfitTests,
-    sets: EffectSets,
-    best: LikelihoodRatio,
-    added: tuple[Effect, ...],
-    name: str,
-    rejected: tuple[tuple[str, Remark], ...],
-) -> SelectionStep:
-    """The round that names an effect which all sets share; the effects in `added` are in the model already."""
-    remaining = [effect for effect in best.effects if effect not in added]
-    remaining.sort(key=lambda effect: effect.name != name)
-    together = likelihood_ratio(tests.fit, remaining, best.fit)
-    note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
-    if not added:
-        return SelectionStep(verdict, tests, (together,), tuple(sets.fitted.values()), rejected, (name,), note)
-    subset = sets.subset(best, (*added, remaining[0]))
-    fits = (together,) if subset is None else (likelihood_ratio(tests.fit, remaining[:1], subset.fit), together)
-    return SelectionStep(verdict, tests, (together,), fits, answer_names=(name,), note=note)
-
-
-def _remainder(tests: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Effect]) -> LikelihoodRatio:
-    """What a set adds to the effects that are in the model already."""
-    names = {effect.name for effect in added}
-    remaining = [effect for effect in hypothesis.effects if effect.name not in names]
-    return likelihood_ratio(tests.fit, remaining, hypothesis.fit)
