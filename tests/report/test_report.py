@@ -235,7 +235,7 @@ def test_the_page_says_what_the_trials_could_have_seen():
     sizes = tuple(1 + 0.1 * (probability - 0.9) for probability in PROBABILITIES)
     drag = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
     leak = replace(drag, effect="leak", symbol="1/τ", unit="1/s", largest=0.5)
-    power = Power(24, 3.6, {"scores of all candidates": 0.003}, (leak, drag), {"static_yield": "no trace"})
+    power = Power(24, 0.003, (leak, drag), {"static_yield": "no trace"})
     told = replace(read(diagnosis("adequate")), power=power)
     html = page(diagnosis=told)
     part = html.partition('<h2 id="power">')[2].partition("<h2")[0]
