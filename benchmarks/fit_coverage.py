@@ -28,12 +28,12 @@ import pandas as pd
 from rich.progress import track
 
 import vinetrack as vt
-from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.units import AIR_DENSITY_KG_M3, BASE_EFFECTS, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
+from vinetrack.paper.published import CHAMBER_L
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"

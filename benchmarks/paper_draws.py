@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.core import published
 from vinetrack.core.records import Floats, Trial
+from vinetrack.paper import published
 from vinetrack.paper.motions import LASTS_S, NONE, WITHIN, follow, position_rms_m, position_trials
 
 TRIALS, B_SCATTER, PRESSURE_SCATTER = 4, 0.03, 0.01

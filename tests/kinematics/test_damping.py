@@ -13,7 +13,6 @@ from odrpack import odr_fit
 from scipy.stats import binom
 
 import vinetrack as vt
-from vinetrack.core.published import DAMPING_B, DIAMETER_MM, EXPONENT, THICKNESS_UM
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import RunSettings
@@ -22,6 +21,7 @@ from vinetrack.kinematics.damping import fit_damping, fit_laws, fit_scaling, fit
 from vinetrack.kinematics.summary import CONDITION_COLUMNS, look_at_motions, redo_damping
 from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, isometric_vine
 from vinetrack.laboratory.tracks import campaign as of_vine
+from vinetrack.paper.published import DAMPING_B, DIAMETER_MM, EXPONENT, THICKNESS_UM
 
 N = 0.37
 B = {"R1": 0.57, "R2": 1.83, "R3": 4.54, "R4": 6.44}

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
 
-from vinetrack.core import published
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
@@ -21,6 +20,7 @@ from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
+from vinetrack.paper import published
 from vinetrack.pipeline.effects_stage import propose_effect
 from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core import published
 from vinetrack.core.units import interval, number, with_interval
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
 from vinetrack.narrative.diagnosis_text import METHOD_NAMES
+from vinetrack.paper import published
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from vinetrack.core import published
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_csv, write_text
 from vinetrack.core.units import BASE_EFFECTS
@@ -24,6 +23,7 @@ from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
+from vinetrack.paper import published
 from vinetrack.tracks.position_noise import ar1_noise
 
 DAMPING = "eversion_damping.B"

@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 
 from vinetrack import effects
-from vinetrack.core import published
 from vinetrack.core.records import Floats, Trial, plain_track
 from vinetrack.core.units import AIR_DENSITY_KG_M3, AMBIENT_PRESSURE_PA
 from vinetrack.dynamics.model import Model, base_model
@@ -27,6 +26,7 @@ from vinetrack.kinematics.damping import fit_laws
 from vinetrack.kinematics.force import paper_force_N
 from vinetrack.kinematics.steady import paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
+from vinetrack.paper import published
 from vinetrack.planning.predictive_inputs import damping_prior
 
 

@@ -19,12 +19,11 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtr
 
-from vinetrack.core import published
-from vinetrack.core.published import SOURCE
 from vinetrack.core.records import Trial
 from vinetrack.core.units import GRAVITY_M_S2, convert, or_nan
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.damping import regress
+from vinetrack.paper import published
 from vinetrack.paper.motions import (
     DEPARTURES,
     area_m2,
@@ -34,6 +33,7 @@ from vinetrack.paper.motions import (
     speeds_at,
     volume_change,
 )
+from vinetrack.paper.published import SOURCE
 from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
 
 COMPUTED = "computed"

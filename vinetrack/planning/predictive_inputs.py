@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core import published
 from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import convert, number
@@ -26,6 +25,7 @@ from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
+from vinetrack.planning import printed_law
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_summary import FitSummary
@@ -44,14 +44,16 @@ SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
 # Diameter and thickness, m, of the printed vines, by their scale R
-PRINTED_SIZES = {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS_UM[R]) for R in published.DAMPING_B}
+PRINTED_SIZES = {
+    R: (1e-3 * printed_law.DIAMETER_MM[R], 1e-6 * printed_law.THICKNESS_UM[R]) for R in printed_law.DAMPING_B
+}
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
     """The prior of B of a vine of this size, N·(s/m)ⁿ."""
     largest = max(PRINTED_SIZES)
     diameter, thickness = PRINTED_SIZES[largest]
-    return published.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
+    return printed_law.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
 def prior_ratio(trial: Trial, like: Trial) -> float:
@@ -65,7 +67,7 @@ def damping_scatter() -> float:
     >>> round(damping_scatter(), 3)
     0.113
     """
-    residuals = [math.log(published.DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
+    residuals = [math.log(printed_law.DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
@@ -94,7 +96,7 @@ def exponent_sigma() -> float:
     0.012
     """
     dof = (8 + 11) / 2 - 2
-    variances = [published.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in published.DAMPING_R2.values()]
+    variances = [printed_law.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in printed_law.DAMPING_R2.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
@@ -384,7 +386,7 @@ class _Assembly:
         elif place is None and self.printed_scale is not None:
             error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
             why = remark("B_printed", percent=100 * error)
-            self.set(DAMPING, published.DAMPING_B[self.printed_scale], "printed", source=published.SOURCE)
+            self.set(DAMPING, printed_law.DAMPING_B[self.printed_scale], "printed", source=printed_law.SOURCE)
             self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
             # The uncertainties are the scatter of the printed values about the prior, and the exponents of t against D.
@@ -418,7 +420,7 @@ class _Assembly:
             self.set_fitted(EXPONENT, place)
         else:
             error = exponent_sigma()
-            self.set(EXPONENT, published.EXPONENT, "printed", source=published.SOURCE)
+            self.set(EXPONENT, printed_law.EXPONENT, "printed", source=printed_law.SOURCE)
             self.vary(EXPONENT, error, "error of n", "n printed", remark("n_printed", error=error))
 
     def yield_pressure(self) -> None:
@@ -430,7 +432,7 @@ class _Assembly:
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
             place = place if abs(stated - fit.fit.numbers[place].value) <= max(tolerance, 1.0) else None
-        printed_kPa = published.YIELD_PRESSURE_KPA
+        printed_kPa = printed_law.YIELD_PRESSURE_KPA
         if place is not None:
             self.set_fitted(YIELD, place)
         elif math.isfinite(stated):
@@ -439,7 +441,7 @@ class _Assembly:
             self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
         elif self.printed_scale == 4:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
-            self.set(YIELD, 1000 * printed_kPa, "printed", source=published.SOURCE)
+            self.set(YIELD, 1000 * printed_kPa, "printed", source=printed_law.SOURCE)
             why = remark("P_y_printed", kPa=rounding_Pa / 1e3)
             self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
@@ -620,7 +622,7 @@ def _middle_ratio(pairs: Iterable[tuple[Trial, float]]) -> float:
     for trial, speed in pairs:
         if 0 < speed < math.inf:
             drive_N = max(0.0, (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2)
-            damping = drive_N / (trial.travel_ratio * speed) ** published.EXPONENT
+            damping = drive_N / (trial.travel_ratio * speed) ** printed_law.EXPONENT
             ratios.append(damping / damping_prior(trial.diameter_m, trial.thickness_m))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
     return float(np.median(known)) if known else math.nan

@@ -19,7 +19,6 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from vinetrack.core import published
 from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.effects import EffectError, catalogue, own_effects
@@ -48,6 +47,7 @@ from vinetrack.narrative.verdict_text import (
     verdict_sentence,
     verdict_table,
 )
+from vinetrack.paper import published
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:

@@ -1,23 +1,16 @@
-"""Published numbers: Alvarez et al., IEEE Robotics and Automation Letters, 2025.
-
-Only printed numbers are listed here; those with one use stand where they are used, and the priors for other vines
-derived from them in `vinetrack.planning.predictive_inputs`.
+"""Published numbers: those of Table I and the damping law, and what else the paper prints; those with one use stand
+where they are used.
 """
 
 from __future__ import annotations
 
-SOURCE = "Alvarez et al. (2025)"
-DAMPING_B = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}  # Damping coefficient by scale R, N·(s/m)ⁿ
-DAMPING_R2 = {1: 0.964, 2: 0.981, 3: 0.896, 4: 0.971}  # R² of the power law at the steady points of each scale
-EXPONENT = 0.37  # Damping exponent n, one for all scales (published)
-THICKNESS_UM = {1: 50.0, 2: 100.0, 3: 150.0, 4: 200.0}
-DIAMETER_MM = {1: 6.0, 2: 12.0, 3: 18.0, 4: 24.0}  # The four isometric vines of Table I
+from vinetrack.planning.printed_law import *  # noqa: F403
+from vinetrack.planning.printed_law import DIAMETER_MM, THICKNESS_UM
+
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03  # Definition of a steady window (published)
-YIELD_PRESSURE_KPA = 3.0  # Yield pressure of the 24 mm × 200 µm vine, R = 4 (published)
 CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)
 CHAMBER_L = 3.7  # Volume of the chamber, litres (published)
 LONGEST_VINE_MM = 280.0  # Length of the largest vine, 24 mm in diameter (published)
-
 CHAMBER_CHANGE, CHAMBER_ALLOWED = 0.035, 0.05  # Relative change of its volume by the largest vine (published)
 PAYLOAD_G = 35.6  # Payload of Figs. 4 and 9 (published)
 # RMS position error of the model by pressure in kPa, for the 24 mm × 200 µm vine with payload (Fig. 4, Table II)
