@@ -14,7 +14,6 @@ from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.figures import diagnosis_figures as drawn
 from vinetrack.figures.registry import FigureTables, diagnosis_figures, draw, label_conditions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
@@ -26,6 +25,7 @@ from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradict
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
+from vinetrack.results import diagnosis_tables as drawn
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 

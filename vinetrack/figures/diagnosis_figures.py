@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 from vinetrack.narrative.diagnosis_text import drift_condition
-from vinetrack.narrative.verdict_text import estimates_text, expected_text, listed_names
-from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
+from vinetrack.narrative.verdict_text import expected_text
+from vinetrack.results.diagnosis_tables import rms_m
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Floats
-    from vinetrack.diagnosis.result import Diagnosis, Round
 
 BEFORE, AFTER = st.VERMILLION, st.BLUE
 AHEAD, BEHIND = st.BLUE, st.VERMILLION  # Colours of a vine ahead of the model, and behind it
@@ -110,15 +109,6 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
         handles.append(st.line_key(f"{words}: {error_mm} mm rms", color=colour, ls=line))
     growth.legend(handles=handles, loc="lower right", fontsize=9, borderaxespad=0.2, labelspacing=0.3)
     return fig
-
-
-def rms_m(trials: pd.DataFrame, model: str) -> float:
-    """Root mean square error of a model after release, m, every trial with one weight; NaN without prediction."""
-    squares = [
-        float(np.mean((part["lead_position_m"] - part[model]) ** 2))
-        for _, part in trials[trials["time_s"] >= 0].groupby("trial", sort=False)
-    ]
-    return math.sqrt(float(np.mean(squares))) if squares else math.nan
 
 
 # ------------------------------------------------------------------------------
@@ -344,115 +334,3 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
     ax.figure.colorbar(filled, ax=ax).set_label(label)
     ax.set(xlabel=x_words, ylabel=y_words, xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.grid(visible=False)
-
-
-# ------------------------------------------------------------------------------
-# Tables of a stored diagnosis for figures and report.
-#
-# Any part may be missing: there may be no diagnosis, it may have failed, or it may have added no effect.
-
-CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
-
-
-class DiagnosisTables:
-    """Data of the figures of a diagnosis; a table is empty if there is nothing to draw, all without one. `trials` are
-    the positions that `predicted_trials` returns, `tables` the files of the folder `diagnosis` by name. `rounds` are
-    (heading, ranking) pairs, `worst` is the label of the condition that `before_after` shows, `added` the added effects
-    in words.
-    """
-
-    def __init__(
-        self, diagnosis: Diagnosis | None = None, conditions: pd.DataFrame | None = None,
-        trials: pd.DataFrame | None = None, tables: Mapping[str, pd.DataFrame] | None = None,
-    ) -> None:  # fmt: skip
-        found, none, rounds = tables or {}, empty_table(()), diagnosis.rounds if diagnosis else ()
-        described = st.rows(conditions) if conditions is not None else ()
-        labels = {str(row.condition): str(row.condition_label) for row in described}
-        self.trials = empty_table(CURVE_COLUMNS) if trials is None else trials
-        worst = worst_condition(self.trials)
-        self.worst = labels.get(worst, worst)
-        self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
-        self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
-        self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
-        self.added = listed_names(diagnosis.effects if diagnosis else ())
-        self.drift = found.get("drift_groups.csv", none)
-        self.learned_force = found.get("learned_force.csv", none)
-        self.rounds: list[tuple[str, pd.DataFrame]] = []
-        for i, ranked in enumerate(rounds):
-            more = [name for name in ranked.model if name not in rounds[0].model]
-            heading = f"Which is missing with {listed_names(more)} added?"
-            heading = heading if i else "Which effect is missing from the initial model?"
-            self.rounds.append((heading, ranking_table(ranked)))
-
-    @property
-    def ranking(self) -> pd.DataFrame:
-        """The rankings of all rounds in one table."""
-        import pandas as pd
-
-        parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(self.rounds) if len(table)]
-        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-
-
-def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
-    """Read the tables of a results folder; None if it has no diagnosis, or that failed."""
-    diagnosis = read_diagnosis(results)
-    if diagnosis is None or not diagnosis.verdict:
-        return None
-    tables = {path.name: read_result(path) for path in results.diagnosed("moved.csv").parent.glob("*.csv")}
-    return DiagnosisTables(diagnosis, conditions, predicted_trials(results, conditions), tables)
-
-
-def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Return measured and predicted positions of all trials, from release and origin as in `comparison`."""
-    import pandas as pd
-
-    paths = {name: results.trajectories(name) for name in dict.fromkeys(conditions["condition"]) if name}
-    compared = {name: read_result(path) for name, path in paths.items() if path.exists()}
-    parts = []
-    for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
-        path = results.predictions(trial)
-        if condition not in compared or not path.exists():
-            continue
-        table, course = read_result(path), compared[condition][compared[condition]["trial"] == trial]
-        after_m = table["model_after_m"] - (table["lead_position_m"] - course["lead_position_m"].to_numpy())
-        models = {"model_before_m": course["model_position_m"], "model_after_m": after_m.to_numpy()}
-        parts.append(course.assign(condition=condition, **models)[list(CURVE_COLUMNS)])
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
-
-
-def worst_condition(trials: pd.DataFrame) -> str:
-    """Return the condition with the largest RMS error of the initial model; blank without predictions."""
-    import pandas as pd
-
-    parts = trials.groupby("condition", sort=False)
-    errors_m = pd.Series({str(name): rms_m(part, "model_before_m") for name, part in parts}, dtype=float).dropna()
-    return str(errors_m.idxmax()) if len(errors_m) else ""
-
-
-def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, with its
-    error as found there, for the figure `where`.
-    """
-    import pandas as pd
-
-    if located.empty:
-        return pd.DataFrame()
-    counts = trials[trials["time_s"] >= 0].groupby("condition")["trial"].nunique()
-    whole_m = located.groupby("vine")["to_m"].transform("max")
-    parts = {"growth_from": located["from_m"] / whole_m, "growth_to": located["to_m"] / whole_m}
-    names: dict[str, Any] = {
-        "condition_label": located["condition"].map(labels),
-        "n_trials": located["condition"].map(counts),
-    }
-    table = located.assign(**names, **parts, misfit_m=located["mean_residual_m"], scatter_m=located["sigma_m"])
-    columns = ["condition", *names, *parts, "misfit_m", "scatter_m"]
-    place = {condition: i for i, condition in enumerate(labels)}
-    return table.dropna(subset=list(names))[columns].sort_values("condition", key=lambda c: c.map(place), kind="stable")
-
-
-def ranking_table(ranked: Round) -> pd.DataFrame:
-    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN."""
-    import pandas as pd
-
-    columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
-    return pd.DataFrame([vars(c) | {"size": estimates_text(c)} for c in ranked.ranking], columns=columns)

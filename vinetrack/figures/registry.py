@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from vinetrack.figures.style import look
+from vinetrack.results.diagnosis_tables import DiagnosisTables, read_diagnosis_tables
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_json, read_result
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
-    from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
 # Additions to the captions of figures that show the initial model, if the diagnosis refutes it
 SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
@@ -121,8 +121,6 @@ class FigureTables:
             return read_json(self.results.folder / f"{name}.json")
         if name.startswith("paper"):
             return read_result(self.results.folder / f"{name}.csv")
-        from vinetrack.figures.diagnosis_figures import DiagnosisTables
-
         return getattr(self.diagnosed or DiagnosisTables(), name)
 
     @cached_property
@@ -170,8 +168,6 @@ class FigureTables:
     @cached_property
     def diagnosed(self) -> DiagnosisTables | None:
         """Tables of the diagnosis; None if there is none."""
-        from vinetrack.figures.diagnosis_figures import read_diagnosis_tables
-
         return read_diagnosis_tables(self.results, self.trials)
 
 

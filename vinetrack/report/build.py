@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.figures.diagnosis_figures import DiagnosisTables
+    from vinetrack.results.diagnosis_tables import DiagnosisTables
 
 
 # ------------------------------------------------------------------------------
