@@ -156,37 +156,6 @@ def check_figure(path: Path | None) -> None:
 
 
 # ------------------------------------------------------------------------------
-# Colours of pages with a light and a dark scheme, and their mapping from the colours of figures.
-
-# CSS custom property by colour of a figure; purple, sky and orange are visible in either scheme
-TOKENS = {
-    INK: "--ink",
-    GRID: "--grid",
-    MUTED: "--muted",
-    PAPER: "--paper",
-    BLUE.lower(): "--blue",
-    VERMILLION.lower(): "--vermillion",
-    GREEN.lower(): "--green",
-}
-
-
-def page_tokens() -> str:
-    """Return CSS with the values of the properties in the light and the dark scheme."""
-    return Path(__file__).with_name("page_tokens.css").read_text(encoding="utf-8")
-
-
-def page_frame() -> str:
-    """Return CSS of local pages: the properties of `page_tokens`, and the style of page, heading and cards."""
-    return page_tokens() + Path(__file__).with_name("page_frame.css").read_text(encoding="utf-8")
-
-
-def follows_screen(colour: str) -> str:
-    """Return the CSS of a figure's colour, as a property if the page may change it."""
-    token = TOKENS.get(colour.lower())
-    return colour if token is None else f"var({token})"
-
-
-# ------------------------------------------------------------------------------
 # Panels of the figures that every trial has. Axes of matplotlib have some two hundred parts, and take half the time of
 # such a figure. Here one pair without a frame covers the figure, in inches, and panels with few parts lie on it.
 

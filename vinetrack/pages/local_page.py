@@ -1,4 +1,4 @@
-"""What both pages share: a server that answers this machine only, and frames as JPEG."""
+"""What both pages share: a server that answers this machine only, style, and frames as JPEG."""
 
 from __future__ import annotations
 
@@ -22,8 +22,14 @@ LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
 TEMPLATES = Path(__file__).with_name("templates")
+TOKENS_CSS = Path(__file__).parents[1] / "report" / "templates" / "page_tokens.css"  # Colours of either scheme
 
 THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
+
+
+def page_frame() -> str:
+    """Return the style of page, heading and cards, with the colours of a light and a dark scheme."""
+    return TOKENS_CSS.read_text(encoding="utf-8") + (TEMPLATES / "page_frame.css").read_text(encoding="utf-8")
 
 
 class PageServer:

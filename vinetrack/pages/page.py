@@ -21,7 +21,6 @@ from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
-from vinetrack.figures.style import follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
@@ -40,7 +39,7 @@ from vinetrack.pages.campaign import (
     read_campaign,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, TrialSelector
-from vinetrack.pages.local_page import TEMPLATES, PageServer
+from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
 from vinetrack.pages.plots import (
     FilmPanel,
     Plots,
@@ -54,7 +53,7 @@ from vinetrack.pages.plots import (
     vine_colours,
 )
 from vinetrack.pipeline.effects_stage import effects_of
-from vinetrack.report.build import next_experiment, tied_pairs
+from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
 # ------------------------------------------------------------------------------
@@ -202,10 +201,11 @@ class Page:
         self.document.theme = theme()
         self.document.template = templates().get_template("page.html")
         left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
+        on_screen = {colour: f"var({token})" for colour, token in TOKENS.items()}
         self.document.template_variables.update(
             name=campaign.folder.name,
             style=Markup(page_frame() + style),
-            vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(campaign)],
+            vines=[(vine, on_screen.get(colour.lower(), colour)) for vine, colour in vine_colours(campaign)],
             tally=f"{len(campaign.trials)} trials, {len(campaign.conditions)} conditions{left_out}",
         )
 

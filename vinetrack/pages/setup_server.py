@@ -29,7 +29,7 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
 from vinetrack.figures.overlay import draw_strip
-from vinetrack.figures.style import TOKENS, page_frame, page_tokens, render
+from vinetrack.figures.style import render
 from vinetrack.pages.draft_files import (
     Draft,
     cells_of,
@@ -47,9 +47,10 @@ from vinetrack.pages.draft_files import (
     with_shared,
     write_draft,
 )
-from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, PageServer, jpeg
+from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
+from vinetrack.report.build import TOKENS
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
@@ -169,7 +170,7 @@ def _strip_url(fig: Figure) -> str:
     svg = render(fig, ["svg"])["svg"].decode()
     for colour, token in TOKENS.items():
         svg = svg.replace(colour, f"var({token})")
-    svg = svg.replace("<defs>", f"<style>{page_tokens()}</style><defs>", 1)
+    svg = svg.replace("<defs>", f"<style>{TOKENS_CSS.read_text(encoding='utf-8')}</style><defs>", 1)
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 

@@ -24,7 +24,7 @@ from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTE
 from vinetrack.effects import EffectError, catalogue, own_effects
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
-from vinetrack.figures.style import RULE_NAMES, TOKENS, page_tokens, rows
+from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, RULE_NAMES, VERMILLION, rows
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import (
     LAW_METHODS,
@@ -60,6 +60,11 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # Building blocks of the page.
+
+# CSS custom property by colour of a figure, with a value for either scheme in `page_tokens.css`; purple, sky and orange
+# are visible in both.
+TOKENS = {INK: "--ink", GRID: "--grid", MUTED: "--muted", PAPER: "--paper"}
+TOKENS |= {BLUE.lower(): "--blue", VERMILLION.lower(): "--vermillion", GREEN.lower(): "--green"}
 
 
 def inline_picture(picture: str | bytes | None, prefix: str, description: str) -> Markup:
@@ -663,7 +668,6 @@ def build_report(content: dict[str, Any]) -> str:
     return environment.get_template("report.html").render(
         content
         | {
-            "page_tokens": Markup(page_tokens()),
             "headline": damping_headline(content["damping"]),
             "tally": status_tally(content["trials"]),
             "law_methods": LAW_METHODS,
