@@ -24,6 +24,7 @@ from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, draw_str
 from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.pipeline.trials import analyse_trials
+from vinetrack.report import clips
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import Tracking
@@ -286,7 +287,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path):
     assert path == results / "overlays" / "a.mp4"
     with av.open(str(path)) as container:
         pictures = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
-    shown = report_stage.frames_to_show(read_result(Results(results).track("a")))
+    shown = clips.frames_to_show(read_result(Results(results).track("a")))
     assert len(pictures) == len(shown)
     frame = 35
     picture = pictures[frame - shown.start]
@@ -303,7 +304,7 @@ def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_th
         results = Results(campaign(tmp_path / str(diagnosed), diagnosed)[1])
         if diagnosed:
             pd.read_csv(results.predictions("a")).iloc[5:40].to_csv(results.predictions("a"), index=False)
-        edges, release_s = report_stage.edges_to_draw("a", results, read_result(results.track("a")))
+        edges, release_s = clips.edges_to_draw("a", results, read_result(results.track("a")))
         assert [edge.name for edge in edges][: None if not diagnosed else 1] == ["tracked edge"]
         assert release_s == pytest.approx(0.020 if diagnosed else 0.021)
     assert np.flatnonzero(np.isfinite(edges[1].along_px)).tolist() == list(range(5, 40))
@@ -317,7 +318,7 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
         drawn.append(np.array([edge.along_px[frame] for edge in view.edges]))
         return np.repeat(picture[:, :, None], 3, axis=2)
 
-    monkeypatch.setattr("vinetrack.pipeline.report_stage.compose", seen)
+    monkeypatch.setattr("vinetrack.report.clips.compose", seen)
     report_stage.overlay_one(results, "a", seconds=2)
     path, shake_px = results / "analysed" / "a.json", 2.0 * np.sin(np.arange(N))
     content = json.loads(path.read_text())
@@ -325,7 +326,7 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
     path.write_text(json.dumps(content))
     report_stage.overlay_one(results, "a", seconds=2)
     still, shaken = np.split(np.array(drawn), 2)
-    shown = report_stage.frames_to_show(read_result(Results(results).track("a")))
+    shown = clips.frames_to_show(read_result(Results(results).track("a")))
     np.testing.assert_allclose(shaken - still, np.tile(shake_px[shown, None], 3), atol=1e-9)
 
 
@@ -334,7 +335,7 @@ def test_metres_turn_into_pixels_through_lens_and_tilt():
     metres = 2.4e-4 * edge * (1 + 5e-5 * edge)
     seen = np.where((np.arange(200) < 3) | (np.arange(200) > 9), edge, math.nan)
     track = pd.DataFrame({"edge_px": seen, "lead_position_m": metres})
-    assert report_stage.position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
+    assert clips.position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
 
 
 def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop_the_others(tmp_path):
@@ -352,11 +353,11 @@ def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop
 
 
 def test_a_clip_goes_from_before_to_after_the_motion_about_as_long_as_asked_at_a_rate_that_players_know():
-    shown, margin = report_stage.frames_to_show(pd.DataFrame({"edge_px": edge_px()})), report_stage.MARGIN_FRAMES
+    shown, margin = clips.frames_to_show(pd.DataFrame({"edge_px": edge_px()})), clips.MARGIN_FRAMES
     assert shown.start == 21 - margin
     assert 49 + margin <= shown.stop <= 51 + margin
     for n_frames in (10, 30, 200, 1000, 20_000):
-        play_fps, stride = report_stage.playback_rate(n_frames, 6.0)
+        play_fps, stride = clips.playback_rate(n_frames, 6.0)
         assert 4 <= play_fps <= 30
         lasts_s = n_frames / stride / play_fps
         assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)

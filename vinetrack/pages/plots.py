@@ -44,7 +44,7 @@ from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import TEMPLATES, jpeg
-from vinetrack.pipeline.report_stage import position_to_px, shake_along
+from vinetrack.report.clips import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import axis_from_entry
