@@ -27,9 +27,10 @@ from vinetrack.core.problems import InputError, format_problems
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import parse_number, parse_table
 from vinetrack.effects._catalogue import remember
-from vinetrack.experiment.folder import check_experiment, describe_run
+from vinetrack.experiment.folder import check_experiment
 from vinetrack.pipeline.workflow import make_plan
 from vinetrack.results.folder_layout import read_result
+from vinetrack.results.origin import describe_run
 from vinetrack.tracks.importers import read_pressure_trace, read_track
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.track import track_recording

@@ -12,6 +12,7 @@ from test_pipeline import write_campaign
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
+from vinetrack.results import origin
 
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
@@ -144,7 +145,7 @@ def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path, monkeypatch)
 
 def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keeps_its_own(tmp_path):
     first, second = (experiment(tmp_path / week / "vines") for week in ("monday", "friday"))
-    workflow.begin_run(tmp_path / "out" / "vines", first).release()
+    origin.begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
         workflow.run_paths(second, tmp_path / "out")
     assert all(str(folder) in str(refused.value) for folder in (first, second))
@@ -195,7 +196,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
 BEGIN = """
 import time
 from pathlib import Path
-from vinetrack.pipeline.workflow import begin_run
+from vinetrack.results.origin import begin_run
 lock = begin_run(Path("results/vines"), Path("vines"))
 print("begun", flush=True)
 time.sleep(60)
@@ -210,12 +211,12 @@ def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp
         assert other.stdout is not None
         assert other.stdout.readline() == "begun\n"
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
-            workflow.begin_run(paths[1], paths[0])
+            origin.begin_run(paths[1], paths[0])
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
             workflow.run_chain(*paths, 1, print)
         other.kill()
     assert not (paths[1] / "logs").exists()
-    workflow.begin_run(paths[1], paths[0]).release()
+    origin.begin_run(paths[1], paths[0]).release()
 
 
 def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path):
@@ -226,6 +227,6 @@ def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(
             (folder / name).touch()
             if "1e" not in name:
                 os.utime(folder / name, (1e9, 1e9))
-    workflow.begin_run(tmp_path / "results" / "vines", tmp_path / "vines").release()
+    origin.begin_run(tmp_path / "results" / "vines", tmp_path / "vines").release()
     for folder in folders:
         assert sorted(path.name for path in folder.iterdir()) == [f".tmp-{'1e' * 16}.csv", ".tmp-mine"]

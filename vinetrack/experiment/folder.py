@@ -6,19 +6,15 @@ of a single row makes that trial `failed`, unless the experiment is `strict`.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
-import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import vinetrack
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
@@ -551,39 +547,3 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
         text = text.replace("\n", "\r\n")
     tables.write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
     return path
-
-
-def describe_run(
-    experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
-) -> dict[str, Any]:
-    """Return the content of `provenance.json`: versions, platform, SHA-256 of every input, model, settings."""
-    libraries = {name: name for name in ("numpy", "scipy", "pandas", "numba", "av", "matplotlib")}
-    libraries |= {"opencv-python-headless": "cv2", "scikit-image": "skimage"}
-    return {
-        "vinetrack": vinetrack.__version__,
-        "python": platform.python_version(),
-        "platform": f"{platform.system()} {platform.machine()}",
-        "libraries": {name: import_module(module).__version__ for name, module in libraries.items()},
-        "experiment": experiment.absolute().as_posix(),
-        "inputs": {
-            (path.relative_to(experiment) if path.is_relative_to(experiment) else path).as_posix(): _hash_file(path)
-            for path in inputs
-        },
-        "model": list(model),
-        "settings": settings,
-    }
-
-
-def _hash_file(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of a folder of frames; else "missing" or "unreadable"."""
-    if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-        lines = [f"{file.relative_to(path).as_posix()} {_hash_file(file)}\n" for file in files]
-        return hashlib.sha256("".join(lines).encode()).hexdigest()
-    if not path.is_file():
-        return "missing"
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return "unreadable"

@@ -20,7 +20,7 @@ from vinetrack.core.records import UNUSABLE_FLAGS, PictureAxis, Trial, with_flag
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.core.terminal import table
 from vinetrack.core.units import number
-from vinetrack.experiment.folder import Experiment, describe_run
+from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import (
     ExperimentSettings,
     FigureSettings,
@@ -44,6 +44,7 @@ from vinetrack.results.folder_layout import (
     read_result,
     read_source_experiment,
 )
+from vinetrack.results.origin import describe_run
 from vinetrack.video.curved_axis import axis_entry
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.survey import Measurement, measure_recording

@@ -13,7 +13,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,10 +25,9 @@ from vinetrack.core.terminal import table, waiting
 from vinetrack.core.units import number
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
+from vinetrack.results.origin import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
-    from filelock import FileLock
-
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.survey import Keep
@@ -37,16 +35,14 @@ if TYPE_CHECKING:
 Say = Callable[[str], None]
 
 # ------------------------------------------------------------------------------
-# The folders of a run: that of the experiment, and that of its results, which belong to one experiment only.
-
-CLAIM_FILE = "experiment.json"  # File of a results folder that names its experiment from the start of a run
+# The folders of a run: that of the experiment, and that of its results.
 
 
 def find_experiment(folder: Path) -> Path:
     """Return `folder` if it exists."""
     from vinetrack.experiment.sheet import closest_entry
 
-    if experiment := _claim(folder / CLAIM_FILE).get("experiment", ""):
+    if experiment := claim(folder / CLAIM_FILE).get("experiment", ""):
         raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=f"give {experiment}")])
     if folder.exists():
         return folder
@@ -75,26 +71,6 @@ def find_ground_truth(folder: Path, base: Path) -> Path | None:
     return None
 
 
-def refuse_shared_results(results: Path, experiment: Path) -> None:
-    """Refuse a results folder that holds the results of another experiment."""
-    other = "choose another results folder (vinetrack run --results DIR, snakemake --config results=DIR)"
-    for name in ("provenance.json", CLAIM_FILE):
-        made_from = Path(str(_claim(results / name).get("experiment", "")))
-        if made_from.name and made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
-            message = f"holds the results of {made_from}, not of {experiment.absolute()}"
-            remedy = f"{other}, or rename one of the two"
-            raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
-
-
-def _claim(path: Path) -> dict[str, Any]:
-    """Read what a file of the results says of its experiment; empty where there is nothing readable."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def path_problems(*folders: Path) -> list[Problem]:
     """Report folders whose path Snakemake would take for a pattern."""
     message = "has braces or a word in < > in its path, which Snakemake cannot handle"
@@ -105,42 +81,6 @@ def path_problems(*folders: Path) -> list[Problem]:
 def has_wildcard(path: Path) -> bool:
     """Whether Snakemake would take part of a path for a wildcard or a variable, which cannot be escaped."""
     return re.search(r"[{}]|<\w+>", str(path)) is not None
-
-
-# ------------------------------------------------------------------------------
-# Ownership of a results folder: only one run writes it at a time, and a killed run does not block the next one.
-#
-# A run holds a lock of the operating system as long as its process lives. Snakemake's own locks are files, which stay
-# when a run is killed; the profile and `vinetrack run` do without them.
-
-
-def _locked(results: Path) -> FileLock:
-    """Return the lock of a results folder, held by this process."""
-    from filelock import FileLock, Timeout
-
-    results.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(results.absolute() / ".run.lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        process = _claim(results / CLAIM_FILE).get("process", "unknown")
-        message, remedy = f"is being written by another run, process {process}", "wait until it ends, or stop it"
-        raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)]) from None
-    return lock
-
-
-def begin_run(results: Path, experiment: Path) -> FileLock:
-    """Make this process the owner of a results folder until it ends, record that, and clean up after a killed run."""
-    lock = _locked(results)
-    claim = {"experiment": experiment.absolute().as_posix(), "process": os.getpid()}
-    write_text(results / CLAIM_FILE, json.dumps(claim))
-    unfinished = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")  # names of files that are being written
-    for path in [*results.rglob("*"), *experiment.glob("*")]:
-        with contextlib.suppress(OSError):
-            # 60.0: age from which an unfinished file counts as abandoned; others may be written now (chosen)
-            if unfinished.fullmatch(path.name) and time.time() - path.stat().st_mtime >= 60.0:
-                path.unlink()
-    return lock
 
 
 # ------------------------------------------------------------------------------
@@ -398,7 +338,7 @@ def check_before_run(experiment: Path, results: Path, say: Say) -> None:
 def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bool = False) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, a line per stage elsewhere, or all it says."""
     if results.is_dir():
-        _locked(results).release()  # refused, if another running process writes there
+        locked(results).release()  # refused, if another running process writes there
     log = results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.
