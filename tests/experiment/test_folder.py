@@ -24,7 +24,7 @@ from vinetrack.experiment.settings import (
     run_settings,
     setting_entries,
 )
-from vinetrack.pipeline.effects_stage import model_problems
+from vinetrack.pipeline.workflow import model_problems
 
 
 @pytest.fixture

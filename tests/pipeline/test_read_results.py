@@ -20,8 +20,7 @@ from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import published
-from vinetrack.pipeline.effects_stage import propose_effect
-from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradictions
+from vinetrack.pipeline.model_stage import propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build

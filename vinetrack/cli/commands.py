@@ -58,7 +58,8 @@ def _check(experiment: Path) -> Answer:
 @command()
 def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say) -> Answer:
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_lines, run_paths
+    from vinetrack.cli.answers import run_lines
+    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_paths
     from vinetrack.results.folder_layout import Results, read_json
 
     paths = run_paths(folder, results)
@@ -134,7 +135,7 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
 @command()
 def _propose(results: Path, to: Path | None, experiment: Path | None, report: Say) -> Answer:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
-    from vinetrack.pipeline.effects_stage import propose_effect
+    from vinetrack.pipeline.model_stage import propose_effect
     from vinetrack.results.folder_layout import read_source_experiment
 
     lines, files = propose_effect(read_source_experiment(results, experiment), results, to, report)
@@ -144,7 +145,7 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 @command()
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
-    from vinetrack.pipeline.workflow import comparison_lines
+    from vinetrack.cli.answers import comparison_lines
     from vinetrack.results.folder_layout import Results, read_result
 
     return comparison_lines(results), read_result(Results(results).comparison).to_dict("records")
@@ -180,10 +181,10 @@ def _settings(page: Path | None) -> Answer | None:
 @command()
 def _effects(name: str | None, experiment: Path | None) -> Answer:
     """List all effects with formulas, parameters and units, or explain one."""
-    from vinetrack.pipeline.effects_stage import describe_effects
+    from vinetrack.cli.answers import effect_lines
     from vinetrack.pipeline.workflow import find_experiment
 
-    return describe_effects(name, None if experiment is None else find_experiment(experiment))
+    return effect_lines(name, None if experiment is None else find_experiment(experiment))
 
 
 # ------------------------------------------------------------------------------

@@ -135,7 +135,6 @@ def _settings(
     source: Experiment | Path | str | Pairs,
 ) -> tuple[Experiment, Model, tuple[str, ...] | None, dict[str, Effect], Limits] | None:
     """An experiment with the model, candidates, own effects and limits that it states; None for bare pairs."""
-    from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import Experiment, read_experiment
 
     if isinstance(source, (str, Path)):
@@ -143,7 +142,7 @@ def _settings(
     if not isinstance(source, Experiment):
         return None
     settings = source.settings
-    user_effects = own_effects([source.folder / path for path in settings.effects])
+    user_effects = source.user_effects
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 

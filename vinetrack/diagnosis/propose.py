@@ -65,7 +65,7 @@ def add(
     """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
     (the ladder of errors, one row for each model).
     """
-    user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    user_effects = experiment.user_effects
     model = make_model(experiment.settings.model, user_effects)
     if name.endswith(".py"):
         user_effects = {**own_effects([name]), **user_effects}

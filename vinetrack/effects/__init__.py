@@ -7,13 +7,11 @@ own, `own_effects(paths)` all of them, tried out.
 from __future__ import annotations
 
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import (
     EffectError,
     catalogue,
-    explanation,
     find_effect,
-    listing,
     load_effect,
     own_effects,
     remember,
@@ -22,6 +20,7 @@ from vinetrack.effects._catalogue import (
 __all__ = [
     "BASE_EFFECTS",
     "HOOKS",
+    "KINDS",
     "REFERENCE_TRIAL",
     "Effect",
     "EffectError",
@@ -30,9 +29,7 @@ __all__ = [
     "TrialInputs",
     "Worked",
     "catalogue",
-    "explanation",
     "find_effect",
-    "listing",
     "load_effect",
     "own_effects",
     "remember",

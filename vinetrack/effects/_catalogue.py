@@ -1,7 +1,4 @@
-"""Reading effects from files: the catalogue in this folder, and a user's own effects from any path.
-
-`listing` and `explanation` describe effects for the terminal.
-"""
+"""Reading effects from files: the catalogue in this folder, and a user's own effects from any path."""
 
 from __future__ import annotations
 
@@ -26,9 +23,8 @@ from pydantic import TypeAdapter, ValidationError
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Bend, Trial
 from vinetrack.core.tables import file_size, write_text
-from vinetrack.core.terminal import table
 from vinetrack.core.units import BASE_EFFECTS, split_unit
-from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, State, TrialInputs, Worked
 
 # ------------------------------------------------------------------------------
 # First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash.
@@ -186,52 +182,6 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else f" Known are {', '.join(known)}."
     raise EffectError(f"There is no effect named {name!r}.{hint}")
-
-
-def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None = None) -> list[str]:
-    """Return lines with name, kind and parameters of each effect, and its formula below; base effects first."""
-    own = set((user_effects or {}).values())
-    effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
-    kinds = [f"{effect.kind}, own" if effect in own else effect.kind for effect in effects]
-    parameters = [", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–" for effect in effects]
-    entries = zip((effect.name for effect in effects), kinds, parameters, strict=True)
-    head, *lines = table(list(entries), ("name", "kind", "parameters"))
-    return [head, *(part for line, e in zip(lines, effects, strict=True) for part in (line, f"    {e.formula}"))]
-
-
-def explanation(effect: Effect) -> list[str]:
-    """Return lines that describe one effect: the text of its file, its parameters and its relations to
-    other effects.
-    """
-    lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
-    if effect.parameters:
-        head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
-        rows = [_parameter_row(effect, parameter) for parameter in effect.parameters]
-        lines += ["Parameters, in files by the name in brackets:"]
-        lines += [*table(rows, head, indent="  ", align="<" * len(head)), ""]
-    slips = [f"{p.symbol} = {size:.3g}, {done}" for p in effect.parameters for size, done in p.slips]
-    facts = [
-        ("Sizes that result from slips in the sheet", "; ".join(slips)),
-        ("Needs of the trial sheet", ", ".join(effect.needs)),
-        ("Replaces, while in the model", ", ".join(effect.replaces)),
-        ("A pressure measured during growth", "already includes it" if effect.in_trace else ""),
-        ("File", str(effect.path)),
-    ]
-    return [*lines, *(f"{what}: {words}" for what, words in facts if words)]
-
-
-def _parameter_row(effect: Effect, p: Parameter) -> tuple[str, ...]:
-    return (
-        p.symbol,
-        p.unit,
-        f"{p.default:g}",
-        f"{p.bounds[0]:g} to {p.bounds[1]:g}",
-        f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–",
-        # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
-        "–" if p.zero == p.default else f"{p.zero:g}",
-        "all" if p.shared == "all" else f"each {p.shared}",
-        f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}",
-    )
 
 
 # ------------------------------------------------------------------------------

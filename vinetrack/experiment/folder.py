@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
 from vinetrack.tracks.importers import load_track, read_pressure_trace, read_track
+
+if TYPE_CHECKING:
+    from vinetrack.effects import Effect
 
 SETTINGS = "experiment.yaml"
 
@@ -57,6 +60,13 @@ class Experiment:
             return []
         which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
         return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+
+    @property
+    def user_effects(self) -> Mapping[str, Effect]:
+        """The user's own effects by name, read and tried out."""
+        from vinetrack.effects import own_effects
+
+        return own_effects([tables.safe_join(self.folder, path) for path in self.settings.effects])
 
     def trial(self, name: str) -> Trial:
         """Return the trial with this name."""

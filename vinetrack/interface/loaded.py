@@ -25,7 +25,7 @@ from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.effects import catalogue, own_effects
+from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import (
     REQUIRED_FOR_PREDICTION,
     Experiment,
@@ -578,8 +578,7 @@ def named_model(experiment: Experiment | None) -> Model:
     """Return the model that an experiment names, including the user's own effects; without one, the base model."""
     if experiment is None:
         return make_model()
-    settings = experiment.settings
-    return make_model(settings.model, own_effects([experiment.folder / path for path in settings.effects]))
+    return make_model(experiment.settings.model, experiment.user_effects)
 
 
 def example_tracks() -> pd.DataFrame:

@@ -34,7 +34,7 @@ from vinetrack.pages.campaign import (
     slider_range,
 )
 from vinetrack.pages.plots import beside, button, panel, progress_bar, set_text
-from vinetrack.pipeline.effects_stage import propose_effect
+from vinetrack.pipeline.model_stage import propose_effect
 
 if TYPE_CHECKING:
     from vinetrack.pages.page import Page

@@ -52,7 +52,6 @@ from vinetrack.pages.plots import (
     theme,
     vine_colours,
 )
-from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
@@ -443,7 +442,7 @@ def start_server(background: BackgroundFit, port: int | None = None) -> PageServ
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
     source = read_source_experiment(folder, experiment)
-    return read_campaign(folder, source, effects_of(source.folder))
+    return read_campaign(folder, source, source.user_effects)
 
 
 def explore(

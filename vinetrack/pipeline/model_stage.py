@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.problems import INTERNAL_ERROR
+from vinetrack.core.problems import INTERNAL_ERROR, remark
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.tables import write_csv, write_json
+from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
@@ -30,12 +30,13 @@ from vinetrack.diagnosis.ladder import (
     with_host,
 )
 from vinetrack.diagnosis.locate import drift_groups
-from vinetrack.diagnosis.propose import add
-from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.diagnosis.propose import add, propose
+from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
 from vinetrack.dynamics.audit import audit, measured_motion
+from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import EffectError, own_effects
+from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.inference.fit_data import FitError
@@ -43,13 +44,20 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
-from vinetrack.narrative.diagnosis_text import added_in_words
+from vinetrack.narrative.diagnosis_text import added_in_words, proposal_lines
 from vinetrack.narrative.verdict_text import settled_rows, verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
-from vinetrack.pipeline.workflow import comparison_lines
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import Results, empty_table, measured_trials, read_json, read_result
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    empty_table,
+    measured_trials,
+    read_diagnosis,
+    read_json,
+    read_result,
+)
 from vinetrack.tracks.frame_timing import mean_speed
 
 if TYPE_CHECKING:
@@ -64,7 +72,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
     lines = fit_damping(job)
     job.say("fitting the model")
     told = diagnose_results(job, fit_model(job))
-    return [*lines, *comparison_lines(job.results), told]
+    return [*lines, told]
 
 
 def fit_model(job: Job) -> Fit | None:
@@ -114,8 +122,7 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
     """
     model, settings = model_of(experiment), experiment.settings
-    checked = own_effects([experiment.folder / path for path in settings.effects])
-    candidates = candidates_of(model, settings.candidates, checked)
+    candidates = candidates_of(model, settings.candidates, experiment.user_effects)
     if model.names == ("gravity",):
         return None, initial_fit(model, pairs, candidates, free=("gravity.g",))
     initial = initial_fit(model, pairs, candidates, profile=False)
@@ -265,3 +272,46 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) 
     if len(new):
         write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
     return added_in_words(before, after, table, moved((before, after), ("", name)))
+
+
+def propose_effect(
+    experiment: Experiment, folder: Path, to: Path | None, report: Report
+) -> tuple[list[str], list[Path]]:
+    """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
+    results = Results(folder)
+    diagnosis = read_diagnosis(results)
+    if diagnosis is None:
+        raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
+    if diagnosis.contradicted_columns:
+        raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
+    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
+        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.final_verdict)))
+    model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
+    pairs, _ = measured_trials(experiment, results)
+    proposal = propose(model, pairs, report)
+    learned = (diagnosis.missing_force or {}).get("learned") or {}
+    lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
+    facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}
+    facts |= {"before_m": proposal.rms_left_out_m}
+    files = []
+    if proposal.tied:
+        best = proposal.tied[0]
+        origin = remark("law_origin", **facts, rms_m=best.rms_left_out_m, gain=best.ratio.delta_chi2)
+        files.append((best.effect.path.name, best.text(str(origin))))
+    if (table := proposal.table) is not None:
+        origin = remark("table_origin", **facts, rms_m=table.rms_left_out_m)
+        files.append((table.effect.path.name, table.text(str(origin))))
+    paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
+    if to is not None and paths:
+        paths[0] = to
+    for path in paths:
+        if path.exists():
+            raise ResultsError(f"{path} exists already: move it away, or give another file with --to.")
+    for path, (_, text) in zip(paths, files, strict=True):
+        write_text(path, text)
+        remember(path)
+        lines.append(f"Written to {path}. Read it, then fit it with `vinetrack add {path} {folder}`.")
+    if files:
+        settings = experiment.folder / "experiment.yaml"
+        lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
+    return lines, paths

@@ -28,7 +28,7 @@ from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue
+from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue
 from vinetrack.experiment.folder import (
     REQUIRED_FOR_PREDICTION,
     Experiment,
@@ -46,7 +46,6 @@ from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
-from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning import prediction as vines
 from vinetrack.planning.prediction import Choice, Room, VinePrediction
@@ -133,21 +132,14 @@ def read_basis(
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
     if tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
-    user_effects = _own_effects(planned, fit)
+    user_effects = planned.user_effects
+    if fit is not None and not set(fit.fit.names) <= set(catalogue()):
+        user_effects = read_source_experiment(Path(fit.source)).user_effects
     read = [read_sizes(text, user_effects) for text in effects]
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
     stated = StatedValues(**numbers, model=model, effects=names, sizes=sizes, user_effects=user_effects)
     return PredictionBasis(planned, stated, fit, heading)
-
-
-def _own_effects(planned: Experiment, fit: FitNumbers | None = None) -> Mapping[str, Effect]:
-    """Return the user's own effects of the experiment that was fitted, else of that to which a sheet belongs."""
-    if fit is None:
-        return effects_of(planned.folder) if planned.settings.effects else {}
-    if all(name in catalogue() for name in fit.fit.names):
-        return {}
-    return effects_of(Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", ""))))
 
 
 @contextmanager
@@ -512,7 +504,7 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
         pairs = pairs_of(experiment)[0]
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
-    model = make_model(names, effects_of(experiment.folder))
+    model = make_model(names, experiment.user_effects)
     return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
 
 
@@ -537,7 +529,7 @@ def _measured_campaign(
 def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     settings = planned.settings
-    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=_own_effects(planned))
+    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=planned.user_effects)
     of_vines = {trial.vine: trial for trial in reversed(planned.trials)}
     by_vine = {trial.vine: predictive_inputs(of_vines[trial.vine], stated) for trial in planned.trials}
     first = next(iter(by_vine.values()))

@@ -15,16 +15,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems, remark
 from vinetrack.core.tables import write_text
-from vinetrack.core.terminal import table, waiting
-from vinetrack.core.units import number
+from vinetrack.core.terminal import waiting
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
-from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 from vinetrack.results.origin import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
@@ -259,7 +257,6 @@ class CheckReport:
 def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     """Check sheet, settings, effects, tracks and recordings of an experiment; `keep` keeps what is tracked."""
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
-    from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import load_track
@@ -296,6 +293,29 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     if rounding_m > 0:
         notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))
+
+
+def model_problems(experiment: Experiment) -> list[Problem]:
+    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`."""
+    from vinetrack.dynamics.model import check_needs, make_model
+    from vinetrack.effects import EffectError, find_effect
+
+    settings = experiment.settings
+    if settings.model == BASE_EFFECTS and not settings.effects and not settings.candidates:
+        return []
+    if not all((experiment.folder / path).exists() for path in settings.effects):
+        return []
+    column = "effects"
+    try:
+        user_effects = experiment.user_effects
+        column = "candidates"
+        for name in settings.candidates or ():
+            find_effect(name, user_effects)
+        column = "model"
+        check_needs(make_model(settings.model, user_effects), *experiment.trials)
+    except EffectError as error:
+        return [Problem(message=str(error).rstrip("."), file="experiment.yaml", column=column)]
+    return []
 
 
 RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
@@ -373,47 +393,3 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
         raise UserError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
-
-
-# ------------------------------------------------------------------------------
-# What results say in the terminal.
-
-
-def run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
-    are kept, since reading a diagnosis takes most of a second.
-    """
-    results = Results(folder)
-    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
-    lines: list[str] = Kept(folder).made("lines", state, partial(_summary, results))
-    return lines
-
-
-def _summary(results: Results) -> list[str]:
-    from vinetrack.narrative.diagnosis_text import table_lines
-    from vinetrack.narrative.verdict_text import verdict_line
-
-    trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-    failed = trials[trials["status"] == "failed"]
-    lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
-    lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-    lines.append(f"Report: {results.report}")
-    if diagnosis is None or not diagnosis.verdict:
-        return [*lines, "" if diagnosis is None else diagnosis.explanation]
-    notes = [f"! {note}" for note in diagnosis.notes[:1]]
-    return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
-
-
-def comparison_lines(folder: Path) -> list[str]:
-    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty."""
-    results = Results(folder)
-    fit, compared = read_fit(results), read_result(results.comparison)
-    if fit.refused:
-        return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
-    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
-    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
-    shown = (compared[[*scale]] * [*scale.values()]).map(number)
-    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
-    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
-    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
-    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]

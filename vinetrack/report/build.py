@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
-from vinetrack.effects import EffectError, catalogue, own_effects
+from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, RULE_NAMES, VERMILLION, rows
@@ -562,7 +562,7 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         sections = [paper_section(tables.paper, tables.paper_departures, figures)]
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
-        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
+        known |= experiment.user_effects
     moved, laws = (results.diagnosed(name) for name in ("moved.csv", "damping_laws.csv"))
     return {
         "name": experiment.name,
