@@ -11,7 +11,7 @@ import pytest
 from served import served_here
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.core.tables import list_recordings, parse_yaml, read_table
+from vinetrack.core.tables import parse_yaml, read_table
 from vinetrack.pages import draft_files as draft
 from vinetrack.pages.local_page import PageServer
 from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, write_templates
@@ -25,7 +25,8 @@ def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of
     for name in (*names.split(","), *(f"burst/{i:03d}.png" for i in range(5))):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-    assert list_recordings(tmp_path) == ["burst", "monday/a.avi", "run 2.MOV", "run 10.mp4"]
+    assert sorted(["a10", "a1²3", "a2"], key=draft.natural_order) == ["a1²3", "a2", "a10"]
+    assert draft.list_recordings(tmp_path) == ["burst", "monday/a.avi", "run 2.MOV", "run 10.mp4"]
     assert draft.list_pictures(tmp_path) == ["board.png", "calibration/board.mp4"]
     assert draft.list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]
 

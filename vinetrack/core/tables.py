@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
-from vinetrack.core.records import CONTAINERS, IMAGES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,55 +68,9 @@ def is_disk_full(error: BaseException) -> bool:
 
 
 # ------------------------------------------------------------------------------
-# Recordings that lie in the folder.
+# Reading and writing of tables and text.
 
 PROVENANCE = "provenance.json"  # Its presence marks a results folder
-MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
-
-
-def list_recordings(folder: Path, depth: int = 4) -> list[str]:
-    """Return the recordings below a folder, as relative paths in natural order."""
-    # 4: levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
-    found = []
-    for path in entries(folder):
-        if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
-            found.append(path.name)
-        elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
-            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= MIN_PICTURES:
-                found.append(path.name)
-            elif depth > 0:
-                found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
-    return sorted(found, key=natural_order)
-
-
-def entries(folder: Path) -> list[Path]:
-    """Return what a folder holds, without hidden files; nothing if it cannot be read."""
-    try:
-        return [path for path in folder.iterdir() if not path.name.startswith(".")]
-    except OSError:
-        return []
-
-
-def is_calibration(folder: Path) -> bool:
-    """Whether a folder's name says that it holds pictures of a target."""
-    return folder.name.lower().startswith("calib")
-
-
-def _is_stack(path: Path) -> bool:
-    """Whether a TIFF holds as many pictures as a recording needs."""
-    from PIL import Image
-
-    if path.suffix.lower() in (".tif", ".tiff"):
-        with contextlib.suppress(OSError), Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= MIN_PICTURES
-    return False
-
-
-def natural_order(text: str) -> list[Any]:
-    """Sort key that orders numbers in a name by value: 2 before 10."""
-    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", text))]
-
-
 MAX_TABLE_BYTES = 200_000_000  # Largest file read as a table (chosen)
 
 STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard output
@@ -238,19 +191,14 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
 
 def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
     """Split the text into records of stripped cells, each with the number of the line on which it starts."""
-    for strict in (True, False):
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=strict)
-        records, start = [], 1
-        try:
-            for cells in reader:
-                records.append((start, [cell.strip() for cell in cells]))
-                start = reader.line_num + 1
-            break
-        except csv.Error as error:
-            if "end of data" in str(error):
-                raise InputError("has a quotation mark that is never closed", "remove it") from None
-            if not strict:
-                raise InputError(f"is not a table ({error})", "save it as CSV") from None
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True)
+    records, start = [], 1
+    try:
+        for cells in reader:
+            records.append((start, [cell.strip() for cell in cells]))
+            start = reader.line_num + 1
+    except csv.Error as error:
+        raise InputError(f"is not a table (line {start}: {error})", "remove or close quotation marks") from None
     return records
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
-from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
+from vinetrack.core.records import Correction, Floats, Trial
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
@@ -45,7 +45,6 @@ class Experiment:
     lines: dict[str, int] = field(default_factory=dict)
     angle_blank: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
-    recordings: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,7 +142,6 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         lines={row.name: row.line for row in rows},
         angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
         columns=table.columns if table else (),
-        recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
 
 
@@ -461,7 +459,7 @@ def check_experiment(
         if not (path := tables.safe_join(experiment.folder, relative)).exists():
             message, remedy = tables.missing_file_message(path)
             problems.append(Problem("no_file", message, key, file=SETTINGS, value=relative, remedy=remedy))
-    problems += [*_order_problems(experiment.trials), *_in_no_row(experiment)]
+    problems += _order_problems(experiment.trials)
     of_trials: list[Problem] = []
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}
@@ -481,21 +479,6 @@ def _with_location(problem: Problem, experiment: Experiment) -> Problem:
     if problem.column in SHARED and problem.column not in experiment.columns:
         return replace(problem, file=SETTINGS)
     return replace(problem, file=SHEET, line=experiment.lines[problem.trial])
-
-
-def _in_no_row(experiment: Experiment) -> list[Problem]:
-    """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
-    written = (*experiment.recordings, *(path for _, path in experiment.settings.paths))
-    named = {Path(os.path.normpath(path.replace("\\", "/"))) for path in written}
-    named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
-    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in SIDE_FILES}
-    found = [name for name in tables.list_recordings(experiment.folder) if Path(name) not in named]
-    if not found:
-        return []
-    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-    message = f"names no trial for {', '.join(found[:5])}{more}"
-    remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
-    return [Problem("in_no_row", message, "video", file=SHEET, severity="warning", remedy=remedy)]
 
 
 def _check_track(trial: Trial) -> list[Problem]:

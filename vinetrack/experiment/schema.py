@@ -19,6 +19,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number, safe_join
@@ -78,6 +80,12 @@ class Column:
     def in_words(self, value: float) -> str:
         """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`."""
         return f"{'an' if self.quantity[0] in 'aeiou' else 'a'} {self.quantity} of {value:.3g} {self.unit}".rstrip()
+
+    def in_trial(self, value: Any, folder: Path) -> Any:
+        """Return a value as a trial holds it: numbers in SI, files in their folder."""
+        if self.kind in ("number", "choice"):
+            return self.scale.to_si(float(value))
+        return safe_join(folder, value) if self.kind == "path" else value
 
     def of_trial(self, trial: Trial) -> float:
         """Return a trial's value of this column."""
@@ -269,8 +277,7 @@ def _digits(value: float) -> str:
     >>> _digits(28.000000004), _digits(0.5), _digits(100000.0)
     ('28', '0.5', '100000')
     """
-    text = f"{float(f'{value:.6g}'):.12f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
+    return np.format_float_positional(float(f"{value:.6g}") + 0.0, trim="-")
 
 
 def _vine(trial: Trial) -> str:

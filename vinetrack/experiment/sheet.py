@@ -214,14 +214,8 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         "yield_pressure_sigma_kPa": YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0,
     }
     values: dict[str, Any] = {**defaults, **row.values, "trial": row.name}
-    fields: dict[str, Any] = {}
-    for name, value in values.items():
-        column = COLUMNS[name]
-        if column.kind == "path":
-            value = safe_join(folder, value)
-        fields[column.field] = column.scale.to_si(float(value)) if column.kind in ("number", "choice") else value
     return Trial(
-        **fields,
+        **{COLUMNS[name].field: COLUMNS[name].in_trial(value, folder) for name, value in values.items()},
         pressure_unit=row.pressure_unit,
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
