@@ -42,23 +42,25 @@ def test_results_are_named_after_the_last_part_of_the_path(tmp_path, monkeypatch
         assert workflow.make_plan({"experiment": given}, tmp_path).results == Path("results/2024")
 
 
-def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_there_are(tmp_path):
+def test_trials_left_out_get_no_files_and_failed_ones_do_and_every_input_counts(tmp_path):
     rows = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\nc,gone.csv,12,100,300,9999,3,\n"
     folder = experiment(tmp_path / "v", rows)
-    assert (planned(folder).trials, planned(folder).inputs) == (("a", "c"), (folder / "trials.csv", folder / "a.csv"))
-    # A module that an own effect may import is an input too.
+    assert planned(folder).trials == ("a", "c")
+    states = [planned(folder).state, planned(folder).state]
+    # A module that an own effect may import is an input too, and so is a name that Snakemake would take for a pattern.
     (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
     for name in ("brush.py", "beside.py"):
         (folder / name).write_text("")
-    stated = planned(folder).files("<experiment>")
-    assert stated[2:] == [(folder / name).as_posix() for name in ("brush.py", "beside.py")]
-    # A name with a brace, which Snakemake would take for a wildcard, is analysed, and watched by its time.
-    folder = experiment(tmp_path / "w", "a,a{1}.csv,12,100,300,20,3,\n")
+        states.append(planned(folder).state)
     (folder / "a.csv").rename(folder / "a{1}.csv")
-    before = planned(folder)
-    assert (before.trials, before.inputs) == (("a",), (folder / "trials.csv",))
+    (folder / "trials.csv").write_text(SHEET + rows.replace("a.csv", "a{1}.csv"))
+    states.append(planned(folder).state)
+    assert planned(folder).trials == ("a", "c")
     os.utime(folder / "a{1}.csv", (1, 1))
-    assert planned(folder).unwatched != before.unwatched
+    states.append(planned(folder).state)
+    os.utime(folder / "trials.csv", (1, 1))
+    states.append(planned(folder).state)
+    assert [states.index(state) for state in states] == [0, 0, 2, 3, 4, 5, 6]
 
 
 def test_shipped_experiments_are_found_from_anywhere(tmp_path, monkeypatch):
@@ -122,7 +124,7 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path):
     filmed(folder)
     (folder / "experiment.yaml").write_text("published: measured\n")
     plan = planned(folder)
-    known = set(plan.files("<inputs>"))
+    known = set(plan.files("<measurements>"))
     for stage in STAGES.values():
         assert {path for group in stage.reads for path in plan.files(group)} <= known
         known |= {path for group in stage.writes for path in plan.files(group)}

@@ -12,7 +12,8 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment import schema, settings
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.planning import prediction, published
+from vinetrack.paper import published
+from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.candidate_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, grown

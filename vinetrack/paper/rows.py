@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from vinetrack.paper import published
 from vinetrack.paper.motions import (
     DEPARTURES,
     area_m2,
+    comparison_tables,
     drag_shares,
     gauge_left,
     rule_on_noise_free,
@@ -176,6 +177,20 @@ class ExperimentResults:
     positions: pd.DataFrame
     speeds: pd.DataFrame
     departures: pd.DataFrame
+
+
+def paper_tables(
+    trials: Sequence[Trial], mark: str, fit: FitSummary, kinematics: Callable[[str], pd.DataFrame],
+    steady: pd.DataFrame, **files: Any,
+) -> dict[str, pd.DataFrame]:  # fmt: skip
+    """Return the tables of the paper's figures, and `paper` with every number, by name. `kinematics` reads those of a
+    trial; `files` are `damping`, `scaling` and `conditions`.
+    """
+    tables = comparison_tables(trials, fit, kinematics)
+    files |= {name: tables[f"paper_{name}"] for name in ("positions", "speeds", "departures")}
+    of_results = result_rows(ExperimentResults(mark=mark, fit=fit, **files))
+    rows = [*protocol_rows(trials, steady, mark), *of_results, *computed_rows(), *theory_rows(trials)]
+    return tables | {"paper": as_table(rows)}
 
 
 def result_rows(results: ExperimentResults) -> Iterator[Row]:

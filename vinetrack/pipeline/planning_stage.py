@@ -322,7 +322,6 @@ def design_vine(
         raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
         choices = vines.fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    _refuse_standstill(room, choices)
     lines = [*basis.heading, *_vine_lines(room, choices)]
     if figure is not None:
         write_figure(draw_choice(choices), figure)
@@ -334,20 +333,6 @@ def design_vine(
         entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION} | {"final_speed_m_s": speed}
         entries.append({**entry, "fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)})
     return lines, {"warnings": basis.heading, "films": entries}
-
-
-def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
-    """Refuse a design in which no vine reaches its end at the medians of the predictive inputs."""
-    if choices[0].prediction.final.median > 0:
-        return
-    highest_Pa = max(choice.prediction.inputs.trial.pressure_Pa for choice in choices)
-    yield_kPa = choices[0].prediction.inputs.trial.yield_pressure_Pa / 1e3
-    message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
-    remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
-    if highest_Pa < 0.995 * room.pressure_Pa:
-        message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
-        remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
-    raise refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:

@@ -31,7 +31,6 @@ from vinetrack.figures.overlay import TRACKED, Edge, draw_strip
 from vinetrack.figures.registry import FigureTables, campaign_figures, draw, figures_of
 from vinetrack.figures.style import render
 from vinetrack.paper import rows as paper
-from vinetrack.paper.motions import comparison_tables
 from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import build_report, report_content, tally
@@ -158,29 +157,19 @@ def _drawn(names: Sequence[str], folder: Path, trials: tuple[Trial, ...], settin
 def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables of the figures of the paper."""
     experiment, results = job.experiment, Results(job.results)
-    mark = paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED
-    fit = read_fit(results)
-    tables = comparison_tables(experiment.trials, fit, lambda name: read_result(results.kinematics(name)))
-    measured = paper.ExperimentResults(
-        mark=mark,
+    tables = paper.paper_tables(
+        experiment.trials,
+        paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED,
+        read_fit(results),
+        lambda name: read_result(results.kinematics(name)),
+        read_result(results.steady),
         damping=read_json(results.damping),
         scaling=read_json(results.scaling),
         conditions=read_result(results.conditions),
-        fit=fit,
-        positions=tables["paper_positions"],
-        speeds=tables["paper_speeds"],
-        departures=tables["paper_departures"],
     )
-    rows = [
-        *paper.protocol_rows(experiment.trials, read_result(results.steady), mark),
-        *paper.result_rows(measured),
-        *paper.computed_rows(),
-        *paper.theory_rows(experiment.trials),
-    ]
-    table = paper.as_table(rows)
-    for name, content in {**tables, "paper": table}.items():
+    for name, content in tables.items():
         write_csv(results.folder / f"{name}.csv", content)
-    return [f"Comparison with the paper: {tally(table)}"]
+    return [f"Comparison with the paper: {tally(tables['paper'])}"]
 
 
 # ------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ Imports stay light: Snakemake loads this module at every start and in every job.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -70,15 +71,11 @@ def find_ground_truth(folder: Path, base: Path) -> Path | None:
 
 
 def path_problems(*folders: Path) -> list[Problem]:
-    """Report folders whose path Snakemake would take for a pattern."""
+    """Report folders of whose path Snakemake would take part for a wildcard or a variable, which cannot be escaped."""
     message = "has braces or a word in < > in its path, which Snakemake cannot handle"
     remedy = "rename the folder, or run the stages one by one with vinetrack"
-    return [Problem(message=message, file=str(folder), remedy=remedy) for folder in folders if has_wildcard(folder)]
-
-
-def has_wildcard(path: Path) -> bool:
-    """Whether Snakemake would take part of a path for a wildcard or a variable, which cannot be escaped."""
-    return re.search(r"[{}]|<\w+>", str(path)) is not None
+    named = [folder for folder in map(str, folders) if re.search(r"[{}]|<\w+>", folder)]
+    return [Problem(message=message, file=folder, remedy=remedy) for folder in named]
 
 
 # ------------------------------------------------------------------------------
@@ -91,26 +88,26 @@ TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings o
 @dataclass(frozen=True)
 class WorkflowPlan:
     """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
-    gets empty ones), `filmed` those that are recordings; `inputs` are all input files that Snakemake can watch, and
-    `unwatched` is the state of the others.
+    gets empty ones), `filmed` those that are recordings; `measurements` are files that the virtual laboratory makes,
+    and `state` is that of all files that people brought.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
     filmed: tuple[str, ...]
-    inputs: tuple[Path, ...]
-    unwatched: str
+    measurements: tuple[Path, ...]
+    state: str
     settings: RunSettings
     ground_truth: Path | None
 
     @property
     def version_file(self) -> str:
-        """A file of the results that changes with the package, which reruns everything, and with inputs that Snakemake
-        cannot watch. Parameters of rules would not do: Snakemake compares them only with what it ran from the same
-        folder, and `snakemake` and `vinetrack run` run from different ones.
+        """A file of the results that changes with the package and with any input, which reruns everything; what a stage
+        need not make again is kept. Snakemake need not watch inputs itself, whose names it may take for patterns, and
+        parameters of rules would not do: it compares them only with what it ran from the same folder.
         """
-        path, version = self.results / "logs" / "version", f"{code_hash()} {self.unwatched}"
+        path, version = self.results / "logs" / "version", f"{code_hash()} {self.state}"
         if not path.exists() or path.read_text(encoding="utf-8") != version:
             write_text(path, version)
         return path.as_posix()
@@ -139,8 +136,7 @@ class WorkflowPlan:
                 pictures = ("trial", "strip") if trial in self.filmed else ("trial",)
                 paths += [f"figures/{kind}_{trial}.{form}" for kind in pictures for form in formats]
             return [self.result(path) for path in paths]
-        kinds = {"<experiment>": (True,), "<measurements>": (False,), "<inputs>": (True, False)}[group]
-        return [path.as_posix() for path in self.inputs if _is_stated(path) in kinds]
+        return [path.as_posix() for path in self.measurements]
 
     def result(self, *parts: str) -> str:
         """Path of a result."""
@@ -164,13 +160,8 @@ def input_files(experiment: Experiment) -> list[Path]:
     return list(dict.fromkeys(files))
 
 
-def _is_stated(path: Path) -> bool:
-    """Whether an input is written by people: the sheet, settings, corrections, and effects."""
-    return path.name in SHARED_FILES or path.suffix == ".py"
-
-
 def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """Plan a run: read the settings and the sheet, and list the input files."""
+    """Plan a run: read the settings and the sheet, and look at the input files."""
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
 
@@ -187,20 +178,17 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     if problems := path_problems(folder, results):
         raise ExperimentError(problems)
     refuse_shared_results(results, folder)
-    # The virtual laboratory has yet to make the measurements of its experiments.
-    inputs = [
-        path
-        for path in input_files(experiment)
-        if (os.access(path, os.R_OK) and (path.is_file() or path.is_dir())) or (ground_truth and not _is_stated(path))
-    ]
-    unwatched = [identity(path) for path in inputs if has_wildcard(path)]
+    inputs = input_files(experiment)
+    brought = {path for path in inputs if path.name in SHARED_FILES or path.suffix == ".py" or not ground_truth}
+    stats = [(path.relative_to(folder).as_posix(), path.stat()) for path in inputs if path in brought and path.exists()]
+    state = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     return WorkflowPlan(
         experiment=folder,
         results=results,
         trials=tuple(name for name in experiment.names if name not in experiment.left_out),
         filmed=tuple(trial.name for trial in experiment.trials if trial.video is not None),
-        inputs=tuple(path for path in inputs if not has_wildcard(path)),
-        unwatched=repr(unwatched),
+        measurements=tuple(path for path in inputs if path not in brought),
+        state=hashlib.sha256(repr(state).encode()).hexdigest(),
         settings=settings,
         ground_truth=ground_truth,
     )
@@ -220,10 +208,9 @@ def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
     report is newer than all inputs; not after a listing, a dry run, or a run that failed.
     """
     path = plan.results / "report.html"
-    if workflow.execution_settings is not None and not workflow.dryrun and path.exists():
-        made = path.stat().st_mtime
-        if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
-            print(f"Report: {path}", flush=True)
+    ran = workflow.execution_settings is not None and not workflow.dryrun and path.exists()
+    if ran and path.stat().st_mtime >= Path(plan.version_file).stat().st_mtime:
+        print(f"Report: {path}", flush=True)
 
 
 # ------------------------------------------------------------------------------
