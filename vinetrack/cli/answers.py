@@ -3,43 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.tables import safe_join
 from vinetrack.core.terminal import table
 from vinetrack.core.units import number
-from vinetrack.pipeline.stages import Kept, code_hash, identity
-from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
+from vinetrack.results.folder_layout import Results, read_fit, read_result
 
 if TYPE_CHECKING:
     from vinetrack.effects import Effect
-
-
-def run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
-    are kept, since reading a diagnosis takes most of a second.
-    """
-    results = Results(folder)
-    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
-    lines: list[str] = Kept(folder).made("lines", state, partial(_summary, results))
-    return lines
-
-
-def _summary(results: Results) -> list[str]:
-    from vinetrack.narrative.diagnosis_text import table_lines
-    from vinetrack.narrative.verdict_text import verdict_line
-
-    trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-    failed = trials[trials["status"] == "failed"]
-    lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
-    lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-    lines.append(f"Report: {results.report}")
-    if diagnosis is None or not diagnosis.verdict:
-        return [*lines, "" if diagnosis is None else diagnosis.explanation]
-    notes = [f"! {note}" for note in diagnosis.notes[:1]]
-    return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
 
 
 def comparison_lines(folder: Path) -> list[str]:
@@ -76,15 +49,9 @@ def effect_lines(name: str | None, experiment: Path | None) -> tuple[list[str], 
     else:
         effects = [find_effect(name, own)]
         lines = _explanation(effects[0])
+    facts = [{"name": one.name, "kind": one.kind, "text": one.text, "own": one.name in own} for one in effects]
     return lines, [
-        {
-            "name": one.name,
-            "kind": one.kind,
-            "text": one.text,
-            "parameters": [asdict(parameter) for parameter in one.parameters],
-            "own": one.name in own,
-        }
-        for one in effects
+        fact | {"parameters": list(map(asdict, one.parameters))} for fact, one in zip(facts, effects, strict=True)
     ]
 
 

@@ -58,8 +58,7 @@ def _check(experiment: Path) -> Answer:
 @command()
 def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say) -> Answer:
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.cli.answers import run_lines
-    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_paths
+    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_lines, run_paths
     from vinetrack.results.folder_layout import Results, read_json
 
     paths = run_paths(folder, results)

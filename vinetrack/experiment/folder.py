@@ -172,9 +172,6 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     problems += found
     if "trial" not in table.columns:
         problems.append(_absent_column("trial"))
-    if not {"video", "track"} & set(table.columns):
-        message, remedy = "has neither a column video nor a column track", "add the one that applies"
-        problems.append(Problem("no_recording", message, file=SHEET, remedy=remedy))
     return table
 
 

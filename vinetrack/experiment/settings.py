@@ -20,24 +20,16 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, Union, get_args, g
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
-from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
+from pydantic.functional_validators import AfterValidator, field_validator, model_validator
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, read_range
 
-
-def _no_yes_or_no(value: Any) -> Any:
-    """Refuse yes and no, which pydantic would convert to 1 and 0."""
-    if isinstance(value, bool):
-        raise InputError("is yes or no where a number belongs", "write the number", code="not_a_number")
-    return value
-
-
 InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
-Number = Annotated[float, BeforeValidator(_no_yes_or_no)]
-Count = Annotated[int, BeforeValidator(_no_yes_or_no)]
+Number = Annotated[float, Field(strict=True)]  # neither text nor yes and no, which pydantic would convert to 1 and 0
+Count = Annotated[int, Field(strict=True)]
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
 Pixel = tuple[Number, Number]
@@ -285,7 +277,7 @@ class FigureSettings(_Strict):
     def _some(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
             raise InputError("is empty", "name at least one of png, svg, pdf", code="empty")
-        return tuple(dict.fromkeys(formats))
+        return formats
 
 
 class OverlaySettings(_Strict):

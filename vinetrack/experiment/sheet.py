@@ -133,8 +133,7 @@ class Row:
             self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
         if pressure > 0 and yield_pressure == 0 and not self.values.get("yield_pressure_sigma_kPa"):
             message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
-            remedy = "measure it (raise the pressure until the tip moves), or state its error in "
-            remedy += "yield_pressure_sigma_kPa"
+            remedy = "measure it (raise the pressure until the tip moves), or state yield_pressure_sigma_kPa"
             self.add("no_yield_pressure", message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
 
 
