@@ -14,7 +14,7 @@ from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.figures.registry import FigureTables, diagnosis_figures, draw, label_conditions
+from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, FigureTables, draw, figures_of, label_conditions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
@@ -134,14 +134,14 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
         found = drawn.read_diagnosis_tables(results, conditions())
         assert found is not None
-        pictures = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
+        pictures = {name: figure for name in figures_of(*DIAGNOSIS_SECTIONS) if (figure := draw(name, found))}
         assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
         for name, figure in pictures.items():
             assert render(figure, ["svg"])["svg"]
-            assert len(getattr(found, diagnosis_figures()[name].data)) > 0
+            assert len(getattr(found, figures_of(*DIAGNOSIS_SECTIONS)[name].data)) > 0
     for name, content in (("none", None), ("refused", refused())):
         assert drawn.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, drawn.DiagnosisTables()) for name in diagnosis_figures())
+    assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*DIAGNOSIS_SECTIONS))
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):

@@ -19,7 +19,7 @@ from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis
 from vinetrack.effects import catalogue
 from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
-from vinetrack.figures.registry import diagnosis_figures
+from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
@@ -221,13 +221,14 @@ def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit():
 
 
 def test_pictures_stand_in_the_parts_they_belong_to():
-    figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
+    keys = figures_of(*DIAGNOSIS_SECTIONS)
+    figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in keys]
     html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-learned_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', 'id="drift"', "figure-drift"]
     places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
     assert places == sorted(places)
-    for key in diagnosis_figures():
+    for key in keys:
         assert f'download="{key}.csv"' in html
 
 

@@ -257,7 +257,7 @@ def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None
     elif x in trend:
         power, spread, p = trend[x]["power"], interval(trend[x]["power_95"]), number(trend[x]["p"], 2)
         words = f"power of the {_SIZES[x][1]} {number(power, 2)}\n({spread}), p = {p}"
-    st.corner_text(ax, 0.03, 0.03, words, fontsize=8.5)
+    ax.text(0.03, 0.03, words, transform=ax.transAxes, color=st.MUTED, fontsize=8.5)
 
 
 # ------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 from vinetrack.core.units import number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.figures import style as st
-from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
+from vinetrack.figures.registry import figure
 from vinetrack.narrative.diagnosis_text import drift_condition
 from vinetrack.narrative.verdict_text import expected_text
 from vinetrack.results.diagnosis_tables import rms_m
@@ -77,7 +77,7 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     return fig
 
 
-@figure("before_after", "verdict", "The worst condition", data="before_after", if_refuted=DASHED_REFUTED)
+@figure("before_after", "verdict", "The worst condition", data="before_after")
 def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Figure | None:
     """The condition that the initial model predicts worst. Above, growth of the leading edge since release: every
     replicate (dots), the model before (dashed) and with what was added (full). Below, the misfit, measured minus
@@ -272,7 +272,7 @@ _FORCE_AXES = {
 }
 
 
-@figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force", if_refuted=SHOWS_REFUTED)
+@figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force")
 def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     """The missing force, learned within the fit as a smooth function of the variables on which it most likely
     depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the

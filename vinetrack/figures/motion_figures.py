@@ -11,7 +11,7 @@ import numpy as np
 
 from vinetrack.core.records import UNUSABLE_FLAGS, with_flag
 from vinetrack.figures import style as st
-from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
+from vinetrack.figures.registry import figure
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,7 +110,7 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
 # Model and measurement, one small panel per condition: positions against time, or residuals against growth.
 
 
-@figure("model_comparison", "model", "Model and measurement", data="curves", if_refuted=DASHED_REFUTED)
+@figure("model_comparison", "model", "Model and measurement", data="curves")
 def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Position of the leading edge since release, one panel per condition: every replicate (thin lines), the band
     of one standard deviation around their mean, and the model in use (dashed; full: with the added effects).
@@ -133,7 +133,7 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     return fig
 
 
-@figure("model_residuals", "model", "Residuals of the model", data="comparison.csv", if_refuted=SHOWS_REFUTED)
+@figure("model_residuals", "model", "Residuals of the model", data="comparison.csv")
 def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Measurement minus model against the growth, one panel per condition, one line per trial, with the band of one
     standard deviation of the replicates. With a complete model the lines cross zero within the band; a bend that
@@ -190,7 +190,7 @@ def _model_panels(
             parts.append(st.thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
         times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
         words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
-        st.corner_text(ax, x, y, words, ha=ha, va=va, fontsize=font - 1.5)
+        ax.text(x, y, words, transform=ax.transAxes, color=st.MUTED, ha=ha, va=va, fontsize=font - 1.5)
         longest = max(parts, key=lambda part: float(part["time_s"].iloc[-1]))
         panels.append((ax, parts, longest, styles[row.vine].colour))
     fig.supxlabel(x_label, fontsize=11)

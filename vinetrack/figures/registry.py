@@ -26,17 +26,13 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Trial
 
-# Additions to the captions of figures that show the initial model, if the diagnosis refutes it
-SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
-DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
-
 _Drawing = TypeVar("_Drawing", bound="Callable[..., Figure | None]")
 
 
 @dataclass(frozen=True)
 class RegisteredFigure:
     """One figure of a results folder. `data` is a file of the folder, or the name of a table (no dot), to download
-    beside it; `if_refuted` is added to the caption if the diagnosis refutes the initial model.
+    beside it.
     """
 
     name: str
@@ -44,7 +40,6 @@ class RegisteredFigure:
     title: str
     caption: str
     data: str
-    if_refuted: str
     drawing: Callable[..., Figure | None]
 
     @property
@@ -53,18 +48,18 @@ class RegisteredFigure:
         return tuple(inspect.signature(self.drawing).parameters)
 
 
+DIAGNOSIS_SECTIONS = ("verdict", "where", "candidates", "drift")
+
 _registered: dict[str, RegisteredFigure] = {}
 
 
-def figure(
-    name: str, section: str, title: str, *, data: str = "", if_refuted: str = ""
-) -> Callable[[_Drawing], _Drawing]:
+def figure(name: str, section: str, title: str, *, data: str = "") -> Callable[[_Drawing], _Drawing]:
     """Register the decorated function as the drawing of a figure, and draw it in the common style."""
 
     def register(drawing: _Drawing) -> _Drawing:
         styled = look()(drawing)
         caption = " ".join((drawing.__doc__ or "").split())
-        _registered[name] = RegisteredFigure(name, section, title, caption, data, if_refuted, styled)
+        _registered[name] = RegisteredFigure(name, section, title, caption, data, styled)
         return styled
 
     return register
@@ -73,11 +68,7 @@ def figure(
 @cache
 def all_figures() -> dict[str, RegisteredFigure]:
     """Return all figures by name."""
-    from vinetrack.figures import (  # noqa: F401 - each registers its figures
-        damping_figures,
-        diagnosis_figures,
-        motion_figures,
-    )
+    from vinetrack.figures import damping_figures, diagnosis_figures, motion_figures  # noqa: F401 - each registers its own
 
     return dict(_registered)
 
@@ -89,12 +80,7 @@ def figures_of(*sections: str) -> dict[str, RegisteredFigure]:
 
 def campaign_figures() -> dict[str, RegisteredFigure]:
     """Return the figures of a whole experiment by name, those of its diagnosis last."""
-    return figures_of("damping", "model") | diagnosis_figures()
-
-
-def diagnosis_figures() -> dict[str, RegisteredFigure]:
-    """Return the figures that show the diagnosis by name."""
-    return figures_of("verdict", "where", "candidates", "drift")
+    return figures_of("damping", "model", *DIAGNOSIS_SECTIONS)
 
 
 def draw(name: str, tables: Any) -> Figure | None:

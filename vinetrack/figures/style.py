@@ -264,11 +264,6 @@ def small_title(ax: Axes, title: str, **style: Any) -> None:
     ax.set_title(title, **{"fontsize": 9, "fontweight": "normal", **style})
 
 
-def corner_text(ax: Axes, x: float, y: float, words: str, **style: Any) -> None:
-    """Write muted words at a place in the axes, as fractions of their size."""
-    ax.text(x, y, words, transform=ax.transAxes, **{"color": MUTED, **style})
-
-
 def names_beside(ax: Axes, names: Sequence[str]) -> None:
     """Put names, one per unit, beside the vertical axis, without marks or grid lines."""
     ax.tick_params(axis="y", length=0)

@@ -558,7 +558,7 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     seen = {name: read_json(results.analysed(name)).get("calibration") for name in filmed}
     sections = []
     if experiment.settings.published:
-        figures = _figures(tables, figures_of("paper").values(), diagnosis)
+        figures = _figures(tables, figures_of("paper").values())
         sections = [paper_section(tables.paper, tables.paper_departures, figures)]
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
@@ -571,7 +571,7 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "damping": read_json(results.damping),
         "provenance": provenance,
         "kinematics": {name: read_result(results.kinematics(name)) for name in drawn},
-        "figures": _figures(tables, campaign_figures().values(), diagnosis),
+        "figures": _figures(tables, campaign_figures().values()),
         "motions": {name: _picture(partial(results.trial_figure, name)) for name in drawn},
         "strips": {name: _picture(partial(results.strip_figure, name)) for name in filmed},
         "flags": {name: read_result(results.track(name))["flag"].tolist() for name in filmed},
@@ -598,9 +598,7 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
     return png.read_bytes() if png.exists() else b""
 
 
-def _figures(
-    tables: FigureTables, figures: Iterable[RegisteredFigure], diagnosis: Diagnosis | None
-) -> list[ReportFigure]:
+def _figures(tables: FigureTables, figures: Iterable[RegisteredFigure]) -> list[ReportFigure]:
     """Return the drawn figures with their data: a file of the results, or a table of its own with five digits."""
     shown = []
     for one in figures:
@@ -610,8 +608,7 @@ def _figures(
                 data = (tables.results.folder / name).read_text(encoding="utf-8")
             elif name:
                 name, data = f"{one.name}.csv", _csv(getattr(tables, name))
-            refuted = one.if_refuted if diagnosis is not None and diagnosis.refutes else ""
-            shown.append(ReportFigure(one.name, one.title, f"{one.caption} {refuted}".strip(), picture, name, data))
+            shown.append(ReportFigure(one.name, one.title, one.caption, picture, name, data))
     return shown
 
 
