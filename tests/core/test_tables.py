@@ -9,8 +9,9 @@ import pytest
 
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError
-from vinetrack.core.tables import parse_number, parse_table, parse_yaml, result_file, safe_join, with_value
+from vinetrack.core.tables import parse_number, parse_table, parse_yaml, safe_join, with_value
 from vinetrack.experiment.folder import save_model
+from vinetrack.results.folder_layout import Results
 
 PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
 ROWS = ({"trial": "a", "pressure_kPa": "28.5"}, {"trial": "b", "pressure_kPa": "14"})
@@ -122,7 +123,7 @@ def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused(
             safe_join(Path("exp"), relative)
     for name in NO_NAMES:
         with pytest.raises(InputError):
-            result_file(Path("results/x/tracks"), name, ".csv")
+            Results(Path("results/x")).track(name)
 
 
 def test_csv_is_read_back_to_the_same_values(tmp_path):

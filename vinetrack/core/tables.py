@@ -229,13 +229,6 @@ def safe_join(folder: Path, relative: str) -> Path:
     return folder / inside
 
 
-def result_file(folder: Path, name: str, suffix: str) -> Path:
-    """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`."""
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):
-        raise InputError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
-    return folder / f"{name}{suffix}"
-
-
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it is renamed to `path`, otherwise deleted."""

@@ -225,14 +225,11 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
 
 
 def _quantity_row(quantity: Band) -> tuple[str, str, str, str, str]:
-    """Return name, place, median, band and unit; stresses are in MPa, and forces in mN if all are small."""
+    """Return name, place, median, band and unit; stresses are in MPa."""
     place = "" if math.isnan(quantity.y_over_L) else f"{quantity.y_over_L:g}"
     values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
     if unit == "Pa":
         texts, unit = [number(value / 1e6) for value in values], "MPa"
-    # 0.01: forces are shown in mN if all are below this, N (chosen)
-    elif unit == "N" and max(abs(value) for value in values) < 0.01:
-        texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
         texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)

@@ -6,6 +6,7 @@ Names of trials are always text: `007` stays `007`, and a trial may be called `N
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +17,6 @@ import numpy as np
 
 from vinetrack.core.problems import InputError, UserError
 from vinetrack.core.records import Kinematics, Track, Trial
-from vinetrack.core.tables import result_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,7 +79,9 @@ class _Named:
 
     def __get__(self, results: Results, _: type[Results]) -> Callable[..., Path]:
         def path(name: str, suffix: str = self.suffix) -> Path:
-            return result_file(results.folder / self.folder, f"{self.prefix}{name}", suffix)
+            if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):  # it could leave the folder
+                raise InputError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
+            return results.folder / self.folder / f"{self.prefix}{name}{suffix}"
 
         return path
 
