@@ -112,7 +112,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
 @command()
 def _add(effect: str, results: Path, save: bool, experiment: Path | None, report: Say) -> Answer:
     """Add an effect to the model, refit, and show the error before and after."""
-    from vinetrack.experiment.folder import save_model
+    from vinetrack.pages.settings_edits import save_model
     from vinetrack.pipeline.model_stage import add_effect
     from vinetrack.pipeline.workflow import command_for_results
     from vinetrack.results.folder_layout import read_source_experiment

@@ -520,20 +520,3 @@ def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
     except OSError as error:
         code, message, remedy = "unreadable", f"cannot be read: {error.strerror}", ""
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]
-
-
-def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, its byte-order mark and line ends kept, and add files to `effects:`; return
-    the path.
-    """
-    path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
-    before = path.read_bytes() if path.exists() else b""
-    text = tables.read_text(path) if before else ""
-    listed = list(read_experiment_settings(path).effects)
-    if new := [name for name in files if name not in listed]:
-        text = tables.with_value(text, "effects", [*listed, *new], path.name)
-    text = tables.with_value(text, "model", names, path.name)
-    if b"\r\n" in before:
-        text = text.replace("\n", "\r\n")
-    tables.write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
-    return path

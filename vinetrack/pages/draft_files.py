@@ -23,13 +23,13 @@ from vinetrack.core.tables import (
     read_table,
     read_text,
     read_yaml,
-    with_value,
     write_text,
 )
 from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET
+from vinetrack.pages.settings_edits import with_value
 
 # ------------------------------------------------------------------------------
 # Recordings that lie in the folder.

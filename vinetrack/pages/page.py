@@ -20,7 +20,6 @@ from tornado.ioloop import IOLoop
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.experiment.folder import save_model
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
@@ -52,6 +51,7 @@ from vinetrack.pages.plots import (
     theme,
     vine_colours,
 )
+from vinetrack.pages.settings_edits import save_model
 from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 

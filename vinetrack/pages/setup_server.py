@@ -22,7 +22,7 @@ from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandle
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError
 from vinetrack.core.records import Correction
-from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join, with_value
+from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
@@ -48,6 +48,7 @@ from vinetrack.pages.draft_files import (
     write_draft,
 )
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
+from vinetrack.pages.settings_edits import with_value
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.report.build import TOKENS
