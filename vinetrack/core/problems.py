@@ -6,13 +6,10 @@ remarks on results: a reason, a warning or a note as a code with its numbers; `v
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from importlib import import_module
 from typing import Any
-
-CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
 # Reason given for a trial or stage that an unexpected exception stopped
 INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
@@ -101,17 +98,6 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
         return lines
     errors = sum(problem.severity == "error" for problem in remaining)
     return [*lines[: limit - 1], f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"]
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Suggest the three known names most similar to an unknown one."""
-    nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
-    if not nearest:
-        return ""
-    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
-        return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
-    others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
-    return f"did you mean {nearest[0]}?{others}"
 
 
 def _one_line(text: str) -> str:

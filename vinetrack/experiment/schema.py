@@ -11,9 +11,10 @@ Imports stay light: the command line loads this module at every start.
 from __future__ import annotations
 
 import csv
+import difflib
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -175,9 +176,23 @@ RIG = {name: column.field for name, column in COLUMNS.items() if column.limit an
 GROUPINGS = tuple(name for name, column in COLUMNS.items() if column.kind == "text" and column.shared)
 
 
+CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
+
+
 def option(column: str) -> str:
     """Return the command-line option for a column of the sheet."""
     return "--" + column.replace("_", "-")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Suggest the three known names most similar to an unknown one."""
+    nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
+    if not nearest:
+        return ""
+    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
+        return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
+    others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
+    return f"did you mean {nearest[0]}?{others}"
 
 
 # ------------------------------------------------------------------------------

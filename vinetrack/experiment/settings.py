@@ -22,10 +22,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
 from pydantic.functional_validators import AfterValidator, field_validator, model_validator
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem, did_you_mean
+from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
-from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, read_range
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, did_you_mean, read_range
 
 InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
 Number = Annotated[float, Field(strict=True)]  # neither text nor yes and no, which pydantic would convert to 1 and 0

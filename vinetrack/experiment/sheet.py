@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
+from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, read_table, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
 SHEET = "trials.csv"

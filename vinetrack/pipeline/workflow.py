@@ -46,9 +46,8 @@ def find_experiment(folder: Path) -> Path:
         raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=f"give {experiment}")])
     if folder.exists():
         return folder
-    missing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.parent.is_dir())
-    near = os.path.relpath(missing.with_name(close) if (close := closest_entry(missing)) else missing.parent)
-    remedy = f"did you mean {near}?" if close else f"the nearest existing folder is {near}"
+    close = closest_entry(folder)
+    remedy = f"did you mean {folder.with_name(close)}?" if close else "check the path and its upper and lower case"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
 
 
