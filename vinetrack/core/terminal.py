@@ -6,12 +6,11 @@ Progress is drawn by rich on standard error, and only on a terminal; piped or lo
 from __future__ import annotations
 
 import html
-import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from itertools import zip_longest
+from itertools import repeat, zip_longest
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -40,26 +39,16 @@ def table(
     indent: str = "",
     align: str = "",
 ) -> list[str]:
-    """Format rows as lines of aligned columns: numbers right-aligned, words left-aligned."""
+    """Format rows as lines of aligned columns; `align` is `<` or `>` for each, by default all are left-aligned."""
     from rich.cells import cell_len
 
-    above = [line for line in (header, units) if line]
-    columns = list(zip_longest(*above, *(map(str, row) for row in rows), fillvalue=""))
-    for i, column in enumerate(columns):
-        side = align[i] if align else ">" if _is_numeric(column[len(above) :]) else "<"
+    lines = [*(line for line in (header, units) if line), *(map(str, row) for row in rows)]
+    columns = []
+    for side, column in zip(align or repeat("<"), zip_longest(*lines, fillvalue=""), strict=False):
         width = max(map(cell_len, column))
         rooms = [" " * (width - cell_len(cell)) for cell in column]
-        columns[i] = tuple(
-            room + cell if side == ">" else cell + room for room, cell in zip(rooms, column, strict=True)
-        )
+        columns.append([room + cell if side == ">" else cell + room for room, cell in zip(rooms, column, strict=True)])
     return [(indent + "  ".join(line)).rstrip() for line in zip(*columns, strict=True)]
-
-
-def _is_numeric(cells: Sequence[str]) -> bool:
-    """Whether all cells of a column are numbers or placeholders for a missing one, and at least one is a number."""
-    values = [cell for cell in map(str.strip, cells) if cell not in ("", "–", "-", "—", "nan", "open")]
-    number = r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
-    return bool(values) and all(re.fullmatch(number, cell) for cell in values)
 
 
 @contextmanager

@@ -316,7 +316,7 @@ def _ranking(step: Round) -> list[str]:
         )
         for candidate in testable[:8]  # as many as the terminal shows (chosen)
     ]
-    lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
+    lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", ""), align="<>><<"))
     untestable = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
 
@@ -331,7 +331,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
         cells = (f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)
         body.append((model, *cells, expected_text(*(row[name] for name in EXPECTED)) or "–"))
     headings = ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm", "an adequate model")
-    return list(table(body, headings))
+    return list(table(body, headings, align="<>>>><"))
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
@@ -358,7 +358,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         place = changed.setdefault((title, unit), {})
         place["after" if row["added"] else "before"] = with_error(row["value"] * factor, row["sigma"] * factor)
     body = [(title, of.get("before", "–"), of.get("after", "–"), unit) for (title, unit), of in changed.items()]
-    lines += aligned(body, ("", "before", "after", "unit"))
+    lines += aligned(body, ("", "before", "after", "unit"), align="<>><")
     return lines + [f"! {message}" for message in after.messages]
 
 

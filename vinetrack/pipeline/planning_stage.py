@@ -219,7 +219,7 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
         if abs(one.change) >= 0.005
     ]
     if changes:
-        yield from ("", *table(changes, ("not in the model", "at the size", "final speed", "change")))
+        yield from ("", *table(changes, ("not in the model", "at the size", "final speed", "change"), align="<<<>"))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 
