@@ -369,8 +369,6 @@ MISSING_OR_WRONG = (
     ("predict", *FAST, "--tail-slack", "loose"),
     ("design", "vine"),
     ("design", "vine", "--pressure-kPa", 62000),
-    ("design", "vine", "--pressure-kPa", 2, "--yield-pressure-kPa", 3),
-    ("design", "vine", "--pressure-kPa", 62, "--burst-fraction", 0.05, "--diameter-mm", 25, "--yield-pressure-kPa", 30),
     *(("design", "vine", "--pressure-kPa", 62, "--diameter-mm", text) for text in ("25:5", "5:15:25", "5000")),
     *(("design", "vine", "--pressure-kPa", 62, "--films-um", text) for text in ("2000", "thin", ",")),
     ("design", "vine", "--pressure-kPa", 62, "--effect", "reservoir_depletion"),

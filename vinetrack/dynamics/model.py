@@ -278,9 +278,7 @@ def check_needs(model: Model, *trials: Trial) -> None:
         for effect, column in needs:
             value = _of_trial(column, trial)
             if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
-                error = EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
-                error.effect, error.column = effect.name, column
-                raise error
+                raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
 
 
 # ------------------------------------------------------------------------------

@@ -58,11 +58,7 @@ def announce(path: Path) -> None:
 
 
 class EffectError(UserError, ValueError):
-    """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy. `effect`
-    needs `column`, which is blank, where that is the error.
-    """
-
-    effect = column = ""
+    """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy."""
 
 
 # What an effect may import. It is one file, so that the hash of its text stands for it wherever it lies.

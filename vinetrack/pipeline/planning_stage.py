@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,8 +27,7 @@ from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue
+from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment.folder import (
     REQUIRED_FOR_PREDICTION,
     Experiment,
@@ -42,7 +41,7 @@ from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import check_figure, write_figure
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
+from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
@@ -121,8 +120,7 @@ def read_basis(
     heading: tuple[str, ...] = ()
     if results is not None:
         summary, heading = choose_fit(results, anyway)
-        with planning_errors():
-            fit = FitNumbers(summary, results.as_posix())
+        fit = FitNumbers(summary, results.as_posix())
     if sheet is None:
         planned = planned_trial(cells, needed=needed)
     else:
@@ -142,22 +140,6 @@ def read_basis(
     return PredictionBasis(planned, stated, fit, heading)
 
 
-@contextmanager
-def planning_errors() -> Iterator[None]:
-    """Turn errors of a prediction into those a user reads: a missing input of an effect is named as an option."""
-    try:
-        yield
-    except EffectError as error:
-        if not error.column:
-            raise
-        message, remedy = f"is blank, and the effect {error.effect} needs it", f"give it as {option(error.column)}"
-        problem = Problem(message=message, column=error.column, remedy=f"{remedy} or in the sheet")
-        raise ExperimentError([problem]) from None
-    except (SimulationError, FitError) as error:
-        remedy = " Leave an effect out, or give it another size." if isinstance(error, SimulationError) else ""
-        raise ResultsError(f"{error}{remedy}") from None
-
-
 def refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
     """The error that refuses the value of an option."""
     return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
@@ -175,14 +157,11 @@ def predict_conditions(
 
     check_figure(figure)
     basis = read_basis(**given)
-    with planning_errors():
-        all_inputs = progress(basis.inputs, "predicting")
-        predictions = [
-            vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs
-        ]
-        content = [_json_entry(prediction) for prediction in predictions]
-        several = len(predictions) > 1
-        lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
+    all_inputs = progress(basis.inputs, "predicting")
+    predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
+    content = [_json_entry(prediction) for prediction in predictions]
+    several = len(predictions) > 1
+    lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
         titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
@@ -317,7 +296,7 @@ def design_vine(
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
         raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
-    with planning_errors(), waiting("looking for the fastest vine"):
+    with waiting("looking for the fastest vine"):
         choices = vines.fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     lines = [*basis.heading, *_vine_lines(room, choices)]
     if figure is not None:
@@ -368,7 +347,7 @@ def design_reservoir(
     check_figure(figure)
     basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
     trial, loss, swept = basis.planned.trials[0], within_percent / 100, vines.swept_m3(basis.planned.trials[0])
-    with planning_errors(), waiting("simulating"):
+    with waiting("simulating"):
         inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
         found = vines.chambers(trial, loss)
         lost = {name: _losses(trial, volume_m3) for name, volume_m3 in found.items()}
