@@ -10,7 +10,7 @@ import pytest
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError
 from vinetrack.core.tables import parse_number, parse_table, parse_yaml, safe_join
-from vinetrack.pages.settings_edits import save_model, with_value
+from vinetrack.pages.draft_files import save_model, with_value
 from vinetrack.results.folder_layout import Results
 
 PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"

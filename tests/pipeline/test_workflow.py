@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from test_pipeline import write_campaign
 
+from vinetrack.cli import commands
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
@@ -190,7 +191,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
     assert lines[-1].startswith(f"{verdict}: ")
     assert f"Report: {results / 'report.html'}" in lines
     assert {stage.done for stage in STAGES.values() if stage.done in lines} >= {"trials analysed", "report written"}
-    assert workflow.run_lines(results)[-1] == lines[-1]
+    assert commands._run_lines(results)[-1] == lines[-1]
     assert sorted(path.name for path in elsewhere.iterdir()) == ["out"]
 
 

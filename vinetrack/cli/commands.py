@@ -9,14 +9,21 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from vinetrack.cli.options import MORE, START, Answer, command
 from vinetrack.core.problems import UserError
-from vinetrack.pipeline.stages import STAGES, Job, Stage, compilation_told
+from vinetrack.core.tables import safe_join, write_csv, write_text
+from vinetrack.core.terminal import table, waiting
+from vinetrack.core.units import number
+from vinetrack.pipeline.stages import STAGES, Job, Kept, Stage, code_hash, compilation_told, identity
+
+if TYPE_CHECKING:
+    from vinetrack.effects import Effect
 
 Say = Callable[[str], None]
 
@@ -38,7 +45,6 @@ def _setup(folder: Path, page: bool, port: int | None, browser: bool, say: Say) 
 @command()
 def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
-    from vinetrack.core.terminal import waiting
     from vinetrack.pipeline.report_stage import track_file
 
     with waiting(f"tracking {recording.name}"), compilation_told(say):
@@ -58,7 +64,7 @@ def _check(experiment: Path) -> Answer:
 @command()
 def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say) -> Answer:
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_lines, run_paths
+    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_paths
     from vinetrack.results.folder_layout import Results, read_json
 
     paths = run_paths(folder, results)
@@ -66,7 +72,33 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
         check_before_run(*paths, say)
     run_chain(*paths, cores, say, verbose)
     to = Results(paths[1])
-    return run_lines(to.folder), {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}
+    return _run_lines(to.folder), {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}
+
+
+def _run_lines(folder: Path) -> list[str]:
+    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
+    are kept, since reading a diagnosis takes most of a second.
+    """
+    from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
+
+    results = Results(folder)
+
+    def summary() -> list[str]:
+        from vinetrack.narrative.diagnosis_text import table_lines
+        from vinetrack.narrative.verdict_text import verdict_line
+
+        trials, diagnosis = read_result(results.trials), read_diagnosis(results)
+        failed = trials[trials["status"] == "failed"]
+        lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
+        lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
+        lines.append(f"Report: {results.report}")
+        if diagnosis is None or not diagnosis.verdict:
+            return [*lines, "" if diagnosis is None else diagnosis.explanation]
+        notes = [f"! {note}" for note in diagnosis.notes[:1]]
+        return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
+
+    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
+    return Kept(folder).made("lines", state, summary)
 
 
 @command()
@@ -112,7 +144,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
 @command()
 def _add(effect: str, results: Path, save: bool, experiment: Path | None, report: Say) -> Answer:
     """Add an effect to the model, refit, and show the error before and after."""
-    from vinetrack.pages.settings_edits import save_model
+    from vinetrack.pages.draft_files import save_model
     from vinetrack.pipeline.model_stage import add_effect
     from vinetrack.pipeline.workflow import command_for_results
     from vinetrack.results.folder_layout import read_source_experiment
@@ -144,16 +176,24 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 @command()
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
-    from vinetrack.cli.answers import comparison_lines
-    from vinetrack.results.folder_layout import Results, read_result
+    from vinetrack.results.folder_layout import Results, read_fit, read_result
 
-    return comparison_lines(results), read_result(Results(results).comparison).to_dict("records")
+    fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
+    content = compared.to_dict("records")
+    if fit.refused:
+        return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"], content
+    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
+    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
+    shown = (compared[[*scale]] * [*scale.values()]).map(number)
+    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
+    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
+    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
+    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)], content
 
 
 @command()
 def _overlay(results: Path, trial: str, experiment: Path | None, seconds: float) -> Answer:
     """Write a slowed-down clip of one trial with tracked and modelled edges."""
-    from vinetrack.core.terminal import waiting
     from vinetrack.pipeline.report_stage import overlay_one
 
     with waiting(f"drawing over {trial}"):
@@ -168,7 +208,6 @@ def _overlay(results: Path, trial: str, experiment: Path | None, seconds: float)
 @command()
 def _settings(page: Path | None) -> Answer | None:
     """List all columns of the sheet and all keys of the settings, with unit, default, bounds and meaning."""
-    from vinetrack.core.tables import write_text
     from vinetrack.experiment.settings import reference_content, reference_page
 
     if page is None:
@@ -180,10 +219,60 @@ def _settings(page: Path | None) -> Answer | None:
 @command()
 def _effects(name: str | None, experiment: Path | None) -> Answer:
     """List all effects with formulas, parameters and units, or explain one."""
-    from vinetrack.cli.answers import effect_lines
+    from vinetrack.effects import KINDS, catalogue, find_effect, own_effects
+    from vinetrack.experiment.settings import read_experiment_settings
     from vinetrack.pipeline.workflow import find_experiment
 
-    return effect_lines(name, None if experiment is None else find_experiment(experiment))
+    folder = Path() if experiment is None else find_experiment(experiment)
+    listed = () if experiment is None else read_experiment_settings(folder / "experiment.yaml").effects
+    own = own_effects([safe_join(folder, path) for path in listed])
+    if name is None:
+        effects = sorted({**catalogue(), **own}.values(), key=lambda one: KINDS.index(one.kind))
+        parameters = [", ".join(f"{p.symbol} ({p.unit})" for p in one.parameters) or "–" for one in effects]
+        kinds = [f"{one.kind}, own" if one.name in own else one.kind for one in effects]
+        entries = zip((one.name for one in effects), kinds, parameters, strict=True)
+        head, *rows = table(entries, ("name", "kind", "parameters"))
+        lines = [head, *(part for row, one in zip(rows, effects, strict=True) for part in (row, f"    {one.formula}"))]
+    else:
+        effects = [find_effect(name, own)]
+        lines = _explanation(effects[0])
+    facts = [{"name": one.name, "kind": one.kind, "text": one.text, "own": one.name in own} for one in effects]
+    return lines, [
+        fact | {"parameters": list(map(asdict, one.parameters))} for fact, one in zip(facts, effects, strict=True)
+    ]
+
+
+def _explanation(effect: Effect) -> list[str]:
+    """Lines on one effect: the text of its file, its parameters and its relations to other effects."""
+    lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
+    rows = [
+        (
+            p.symbol,
+            p.unit,
+            f"{p.default:g}",
+            f"{p.bounds[0]:g} to {p.bounds[1]:g}",
+            f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–",
+            # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
+            "–" if p.zero == p.default else f"{p.zero:g}",
+            "all" if p.shared == "all" else f"each {p.shared}",
+            f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}",
+        )
+        for p in effect.parameters
+    ]
+    if rows:
+        head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
+        lines += ["Parameters, in files by the name in brackets:"]
+        lines += [*table(rows, head, indent="  ", align="<" * len(head)), ""]
+    facts = {
+        "Sizes that result from slips in the sheet": "; ".join(
+            f"{p.symbol} = {size:.3g}, {done}" for p in effect.parameters for size, done in p.slips
+        ),
+        "Needs of the trial sheet": ", ".join(effect.needs),
+        "Replaces, while in the model": ", ".join(effect.replaces),
+        "A pressure measured during growth": "already includes it" if effect.in_trace else "",
+        "File": str(effect.path),
+    }
+    return [*lines, *(f"{what}: {words}" for what, words in facts.items() if words)]
 
 
 # ------------------------------------------------------------------------------
@@ -240,7 +329,6 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate."""
     import pandas as pd
 
-    from vinetrack.core.tables import write_csv
     from vinetrack.figures.style import check_figure, write_figure
     from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
 

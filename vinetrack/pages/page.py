@@ -38,6 +38,7 @@ from vinetrack.pages.campaign import (
     read_campaign,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, TrialSelector
+from vinetrack.pages.draft_files import save_model
 from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
 from vinetrack.pages.plots import (
     FilmPanel,
@@ -51,7 +52,6 @@ from vinetrack.pages.plots import (
     theme,
     vine_colours,
 )
-from vinetrack.pages.settings_edits import save_model
 from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 

@@ -45,10 +45,10 @@ from vinetrack.pages.draft_files import (
     read_sheet,
     shared_values,
     with_shared,
+    with_value,
     write_draft,
 )
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
-from vinetrack.pages.settings_edits import with_value
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.report.build import TOKENS

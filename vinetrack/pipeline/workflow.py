@@ -24,7 +24,6 @@ from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import waiting
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
-from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
 from vinetrack.results.origin import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
@@ -380,27 +379,3 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
         raise UserError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
-
-
-def run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
-    are kept, since reading a diagnosis takes most of a second.
-    """
-    results = Results(folder)
-
-    def summary() -> list[str]:
-        from vinetrack.narrative.diagnosis_text import table_lines
-        from vinetrack.narrative.verdict_text import verdict_line
-
-        trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-        failed = trials[trials["status"] == "failed"]
-        lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
-        lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-        lines.append(f"Report: {results.report}")
-        if diagnosis is None or not diagnosis.verdict:
-            return [*lines, "" if diagnosis is None else diagnosis.explanation]
-        notes = [f"! {note}" for note in diagnosis.notes[:1]]
-        return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
-
-    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
-    return Kept(folder).made("lines", state, summary)
