@@ -191,7 +191,7 @@ def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_
     scene = plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
     clip = write_video(tmp_path / "vine.mp4", scene.frames, options={"crf": "12"})
     drawn: list[Tracking] = []
-    monkeypatch.setattr(report_stage, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
+    monkeypatch.setattr(clips, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
     assert "Capture rate unknown" in succeed("track", clip, "--out", tmp_path / "out")
     table = pd.read_csv(tmp_path / "out" / "track.csv")
     assert list(table) == [

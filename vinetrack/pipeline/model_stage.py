@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,7 +39,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import RunSettings
-from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
@@ -68,11 +68,22 @@ log = logging.getLogger(__name__)
 
 
 def fit_and_diagnose(job: Job) -> list[str]:
-    """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks."""
-    lines = fit_damping(job)
+    """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks. A
+    diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
+    """
+    lines, results = fit_damping(job), Results(job.results)
     job.say("fitting the model")
-    told = diagnose_results(job, fit_model(job))
-    return [*lines, told]
+    fitted = fit_model(job)
+    try:
+        diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
+    except Exception as error:
+        reason, pairs = _reason(error), ()
+        explanation = f"No diagnosis could be made: {reason}"
+        diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
+    log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
+    job.say("fitting the damping law under every model")
+    write_diagnosis(results, diagnosis, pairs, job.settings)
+    return [*lines, str(diagnosis)]
 
 
 def fit_model(job: Job) -> Fit | None:
@@ -141,28 +152,8 @@ def _reason(error: Exception) -> str:
 
 # ------------------------------------------------------------------------------
 # Diagnosis of a results folder: which effects the model lacks, and how much they reduce its errors.
-#
-# A diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
 
 Report = Callable[[str], None]
-Pairs = Sequence[tuple[Trial, Track]]
-
-
-def diagnose_results(job: Job, fitted: Fit | None) -> str:
-    """Diagnose the trials, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and `diagnosis/`. Returns
-    the diagnosis in words.
-    """
-    results = Results(job.results)
-    try:
-        diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
-    except Exception as error:
-        reason, pairs = _reason(error), ()
-        explanation = f"No diagnosis could be made: {reason}"
-        diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
-    log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
-    job.say("fitting the damping law under every model")
-    write_diagnosis(results, diagnosis, pairs, job.settings)
-    return str(diagnosis)
 
 
 def diagnosed(

@@ -11,30 +11,24 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
-from vinetrack.core.records import UNUSABLE_FLAGS, PictureAxis, Trial, with_flag
+from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.core.terminal import table
 from vinetrack.core.units import number
 from vinetrack.experiment.folder import Experiment
-from vinetrack.experiment.settings import (
-    ExperimentSettings,
-    FigureSettings,
-    OverlaySettings,
-    read_experiment_settings,
-)
-from vinetrack.figures.overlay import TRACKED, Edge, draw_strip
+from vinetrack.experiment.settings import ExperimentSettings, FigureSettings, OverlaySettings, read_experiment_settings
 from vinetrack.figures.registry import FigureTables, campaign_figures, draw, figures_of
 from vinetrack.figures.style import render
 from vinetrack.paper import rows as paper
 from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import build_report, report_content, tally
-from vinetrack.report.clips import MARGIN_FRAMES, draw_clip, frames_to_show, write_overlay
+from vinetrack.report.clips import recording_facts, write_overlay, write_recording
 from vinetrack.results.folder_layout import (
     Results,
     ResultsError,
@@ -44,13 +38,8 @@ from vinetrack.results.folder_layout import (
     read_source_experiment,
 )
 from vinetrack.results.origin import describe_run
-from vinetrack.video.curved_axis import axis_entry
 from vinetrack.video.frames import RecordingError, inspect_recording
-from vinetrack.video.survey import Measurement, measure_recording
-
-if TYPE_CHECKING:
-    pass
-
+from vinetrack.video.survey import measure_recording
 
 log = logging.getLogger(__name__)
 
@@ -184,8 +173,6 @@ def track_file(
     """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
     given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns the facts as lines and as JSON.
     """
-    if out is not None and out.exists() and not out.is_dir():
-        raise UserError(f"{out}: is a file; name a folder with --out")
     settings, folder = _settings_of(calibration, mm_per_px)
     scaled = math.isfinite(mm_per_px) or calibration is not None
     try:
@@ -212,8 +199,8 @@ def track_file(
         track = measured.tracking.track
         untimed = replace(track, time_s=np.full(len(track.time_s), math.nan))
         measured = replace(measured, tracking=replace(measured.tracking, track=untimed))
-    written = _write(out or Path(f"{recording.path.stem}_track"), measured, scaled)
-    facts = _facts(measured, rate, 1e3 * measured.m_per_px if scaled else math.nan)
+    written = write_recording(out or Path(f"{recording.path.stem}_track"), measured, scaled)
+    facts = recording_facts(measured, rate, 1e3 * measured.m_per_px if scaled else math.nan)
     rows = {name: number(fact) if isinstance(fact, float) else str(fact) for name, fact in facts.items()}
     ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
     rows |= {"axis": "({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)}
@@ -234,68 +221,3 @@ def _settings_of(file: Path | None, mm_per_px: float) -> tuple[ExperimentSetting
     if calibration is None:
         raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
     return ExperimentSettings(calibration=calibration), file.parent
-
-
-def _write(folder: Path, measured: Measurement, scaled: bool) -> dict[str, Path]:
-    """Write the edge of every frame along the axis and in the picture, with errors, and in metres if there is a scale;
-    the strip; and the clip.
-    """
-    import pandas as pd
-
-    tracking, recording, m_per_px = measured.tracking, measured.recording, measured.m_per_px
-    track, axis, name = tracking.track, tracking.axis, recording.path.name
-    assert track.lead_position_systematic_m is not None
-    along_px = track.edge_px + tracking.shake_px
-    columns = {
-        "frame": np.arange(len(track.time_s)),
-        "time_s": track.time_s,
-        "edge_px": track.edge_px,
-        "edge_sigma_px": track.lead_position_sigma_m / m_per_px,
-        "edge_systematic_px": track.lead_position_systematic_m / m_per_px,
-        **dict(zip(("x_px", "y_px"), axis.points(along_px).T, strict=True)),
-    }
-    if scaled:
-        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
-        columns |= {"systematic_m": track.lead_position_systematic_m}
-    content = pd.DataFrame(columns | {"flag": track.flag})
-    written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
-    write_csv(written["table"], content)
-    m_per_px = m_per_px if scaled else math.nan
-    write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
-    shown, edges = frames_to_show(content), [Edge("tracked edge", TRACKED, along_px)]
-    since_s = track.time_s - track.time_s[min(shown.start + MARGIN_FRAMES, len(track.time_s) - 1)]
-    scale = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else axis.width_px, 1e3 * m_per_px
-    draw_clip(written["clip"], name, recording, axis, *scale, edges, since_s, shown, OverlaySettings())
-    return written
-
-
-def _facts(measured: Measurement, rate: float, mm_per_px: float) -> dict[str, Any]:
-    """What a recording is and what was found in it, by names with units; NaN or None where not known."""
-    recording, tracking, track = measured.recording, measured.tracking, measured.tracking.track
-    usable = np.isfinite(track.edge_px) & ~with_flag(track.flag, *UNUSABLE_FLAGS)
-    frame, edge_px = np.flatnonzero(usable), track.edge_px[usable]
-    growth_px = float(np.ptp(edge_px)) if frame.size else math.nan
-    fastest = float(np.nanmax(np.diff(edge_px) / np.diff(frame))) if frame.size > 1 else math.nan
-    sigma_px = track.lead_position_sigma_m[usable & ~with_flag(track.flag, "before_release")] / measured.m_per_px
-    return {
-        "recording": recording.path,
-        "width_px": recording.width,
-        "height_px": recording.height,
-        "bit_depth": recording.bit_depth,
-        "playback_fps": recording.playback_fps,
-        "capture_fps": rate,
-        "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
-        "duration_s": len(track.edge_px) / rate,
-        "n_frames": len(track.edge_px),
-        "n_known": frame.size,
-        "axis": axis_entry(tracking.axis),
-        "mm_per_px": mm_per_px,
-        "scale_rel_sigma": measured.scale_rel_sigma,
-        "tube_width_px": tracking.tube_width_px,
-        "growth_px": growth_px,
-        "growth_mm": mm_per_px * growth_px,
-        "fastest_px_per_frame": fastest,
-        "fastest_m_s": fastest * mm_per_px / 1e3 * rate,
-        "edge_sigma_px": float(np.nanmedian(sigma_px)) if np.isfinite(sigma_px).any() else math.nan,
-        "notes": list(track.notes),
-    }

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems, remark
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import waiting
-from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
 from vinetrack.results.origin import CLAIM_FILE, claim, locked, refuse_shared_results
 
@@ -287,8 +286,6 @@ def model_problems(experiment: Experiment) -> list[Problem]:
     from vinetrack.effects import EffectError, find_effect
 
     settings = experiment.settings
-    if settings.model == BASE_EFFECTS and not settings.effects and not settings.candidates:
-        return []
     if not all((experiment.folder / path).exists() for path in settings.effects):
         return []
     column = "effects"

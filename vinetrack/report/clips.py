@@ -1,4 +1,4 @@
-"""Slowed-down clips of recordings with tracked and modelled edges, `overlays/<trial>.mp4`."""
+"""Slowed-down clips of recordings with tracked and modelled edges; and what is shown of a single recording."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial, with_flag
+from vinetrack.core.records import UNUSABLE_FLAGS, Floats, Trial, with_flag
+from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.experiment.settings import OverlaySettings
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, levels
-from vinetrack.figures.style import GREEN
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
+from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 from vinetrack.video.axis import Axis
-from vinetrack.video.curved_axis import axis_from_entry
+from vinetrack.video.curved_axis import axis_entry, axis_from_entry
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.survey import Measurement
 from vinetrack.video.write import write_clip
 
 if TYPE_CHECKING:
@@ -132,3 +134,72 @@ def position_to_px(track: pd.DataFrame) -> Any:
         raise ResultsError("too few of its positions are known in pixels and in metres")
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
     return np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
+
+
+# ------------------------------------------------------------------------------
+# A single recording, without an experiment: its edge as a table, the strip, the clip; and what it is, in numbers.
+
+
+def write_recording(folder: Path, measured: Measurement, scaled: bool) -> dict[str, Path]:
+    """Write the edge of every frame along the axis and in the picture, with errors, and in metres if there is a scale;
+    the strip; and the clip.
+    """
+    import pandas as pd
+
+    tracking, recording, m_per_px = measured.tracking, measured.recording, measured.m_per_px
+    track, axis, name = tracking.track, tracking.axis, recording.path.name
+    assert track.lead_position_systematic_m is not None
+    along_px = track.edge_px + tracking.shake_px
+    columns = {
+        "frame": np.arange(len(track.time_s)),
+        "time_s": track.time_s,
+        "edge_px": track.edge_px,
+        "edge_sigma_px": track.lead_position_sigma_m / m_per_px,
+        "edge_systematic_px": track.lead_position_systematic_m / m_per_px,
+        **dict(zip(("x_px", "y_px"), axis.points(along_px).T, strict=True)),
+    }
+    if scaled:
+        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
+        columns |= {"systematic_m": track.lead_position_systematic_m}
+    content = pd.DataFrame(columns | {"flag": track.flag})
+    written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
+    write_csv(written["table"], content)
+    m_per_px = m_per_px if scaled else math.nan
+    write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
+    shown, edges = frames_to_show(content), [Edge("tracked edge", TRACKED, along_px)]
+    since_s = track.time_s - track.time_s[min(shown.start + MARGIN_FRAMES, len(track.time_s) - 1)]
+    scale = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else axis.width_px, 1e3 * m_per_px
+    draw_clip(written["clip"], name, recording, axis, *scale, edges, since_s, shown, OverlaySettings())
+    return written
+
+
+def recording_facts(measured: Measurement, rate: float, mm_per_px: float) -> dict[str, Any]:
+    """What a recording is and what was found in it, by names with units; NaN or None where not known."""
+    recording, tracking, track = measured.recording, measured.tracking, measured.tracking.track
+    usable = np.isfinite(track.edge_px) & ~with_flag(track.flag, *UNUSABLE_FLAGS)
+    frame, edge_px = np.flatnonzero(usable), track.edge_px[usable]
+    growth_px = float(np.ptp(edge_px)) if frame.size else math.nan
+    fastest = float(np.nanmax(np.diff(edge_px) / np.diff(frame))) if frame.size > 1 else math.nan
+    sigma_px = track.lead_position_sigma_m[usable & ~with_flag(track.flag, "before_release")] / measured.m_per_px
+    return {
+        "recording": recording.path,
+        "width_px": recording.width,
+        "height_px": recording.height,
+        "bit_depth": recording.bit_depth,
+        "playback_fps": recording.playback_fps,
+        "capture_fps": rate,
+        "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
+        "duration_s": len(track.edge_px) / rate,
+        "n_frames": len(track.edge_px),
+        "n_known": frame.size,
+        "axis": axis_entry(tracking.axis),
+        "mm_per_px": mm_per_px,
+        "scale_rel_sigma": measured.scale_rel_sigma,
+        "tube_width_px": tracking.tube_width_px,
+        "growth_px": growth_px,
+        "growth_mm": mm_per_px * growth_px,
+        "fastest_px_per_frame": fastest,
+        "fastest_m_s": fastest * mm_per_px / 1e3 * rate,
+        "edge_sigma_px": float(np.nanmedian(sigma_px)) if np.isfinite(sigma_px).any() else math.nan,
+        "notes": list(track.notes),
+    }
