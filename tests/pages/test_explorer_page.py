@@ -254,10 +254,10 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_find
     numbers.model(f"tick_{EFFECT}").active = True
     settled(numbers)
     on_page = bars_mm(numbers, "now")
-    succeed("add", EFFECT, results, "--save")
-    ladder = pd.read_csv(results / "ladder.csv").set_index("added")
+    succeed("add", EFFECT, results, "--save", "--json", results / "added.json")
+    *_, added = json.loads((results / "added.json").read_text())["ladder"]
     overall_m = 1e-3 * float(np.sqrt(np.mean(np.square(list(on_page.values())))))
-    assert ladder.loc[EFFECT, "rms_in_sample_m"] == pytest.approx(overall_m, rel=5e-3)
+    assert (added["added"], added["rms_in_sample_m"]) == (EFFECT, pytest.approx(overall_m, rel=5e-3))
 
     campaign = open_campaign(results)
     assert campaign.in_use == tuple(json.loads((results / "fit.json").read_text())["model"])

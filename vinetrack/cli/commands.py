@@ -155,12 +155,12 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
         raise UserError(
             f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
         )
-    lines = add_effect(read, results, effect, report)
+    lines, ladder = add_effect(read, results, effect, report)
     if save:
         name = Path(effect).stem if own_files else effect
         path = save_model(read.folder, [*read.settings.model, name], [file.name for file in own_files])
         lines.append(f"Saved to {path}; to update all results: {command_for_results(read.folder, results)}")
-    return lines, {"effect": effect, "saved": save, "lines": lines}
+    return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder}
 
 
 @command()

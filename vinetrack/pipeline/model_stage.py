@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 from vinetrack.narrative.diagnosis_text import added_in_words, proposal_lines
-from vinetrack.narrative.verdict_text import settled_rows, verdict_sentence, verdict_table
+from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
@@ -56,7 +56,6 @@ from vinetrack.results.folder_layout import (
     measured_trials,
     read_diagnosis,
     read_json,
-    read_result,
 )
 from vinetrack.tracks.frame_timing import mean_speed
 
@@ -248,21 +247,11 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     return found
 
 
-def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> list[str]:
-    """Add an effect to the model and refit; the errors are appended to `ladder.csv`."""
-    import pandas as pd
-
-    results = Results(folder)
-    pairs, _ = measured_trials(experiment, results)
+def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> tuple[list[str], Any]:
+    """Add an effect to the model and refit. Returns lines, and the ladder of errors of both models."""
+    pairs, _ = measured_trials(experiment, Results(folder))
     before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
-    history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
-    rows = table if not len(history) else table.iloc[1:]
-    settled = settled_rows(history)
-    recorded = set(zip(settled["model"], settled["added"].fillna(""), strict=True))
-    new = rows[[(model, added) not in recorded for model, added in zip(rows["model"], rows["added"], strict=True)]]
-    if len(new):
-        write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
-    return added_in_words(before, after, table, moved((before, after), ("", name)))
+    return added_in_words(before, after, table, moved((before, after), ("", name))), table.to_dict("records")
 
 
 def propose_effect(
