@@ -49,14 +49,7 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    empty_table,
-    measured_trials,
-    read_diagnosis,
-    read_json,
-)
+from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
 from vinetrack.tracks.frame_timing import mean_speed
 
 if TYPE_CHECKING:
@@ -94,7 +87,7 @@ def fit_model(job: Job) -> Fit | None:
     try:
         initial, fit = _fits(experiment, pairs)
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
-        check, messages = empty_table(CHECK_COLUMNS), list[str]()
+        check, messages = table_of(CHECK_COLUMNS), list[str]()
         try:
             check = check_damping(fit, damping["log_log" if damping["both_axes"].get("refused") else "both_axes"])
         except FitError as error:
@@ -109,7 +102,7 @@ def fit_model(job: Job) -> Fit | None:
         trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
-        trajectories, tables = {}, [*map(empty_table, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS))]
+        trajectories, tables = {}, [*map(table_of, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS))]
     for path, table in zip((results.comparison, results.model_check, results.audit), tables, strict=True):
         write_csv(path, table)
     _emptied(results.folder / "comparison")
@@ -194,7 +187,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     folder = _emptied(results.folder / "diagnosis")
     tables = diagnosis_tables(diagnosis)
-    tables |= {"moved.csv": empty_table(MOVED_COLUMNS), "damping_laws.csv": empty_table(LAW_COLUMNS)}
+    tables |= {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
         tables["damping_laws.csv"] = _laws(diagnosis, pairs, settings)
@@ -203,7 +196,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_csv(folder / name, table)
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
-    write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
+    write_csv(results.ladder, table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
 
@@ -216,7 +209,7 @@ def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataF
             laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
         except ValueError as error:
             log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
-    return law_table(laws) if laws else empty_table(LAW_COLUMNS)
+    return law_table(laws) if laws else table_of(LAW_COLUMNS)
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:

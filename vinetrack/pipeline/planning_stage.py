@@ -47,7 +47,6 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning import prediction as vines
-from vinetrack.planning.prediction import Choice, Room, VinePrediction
 from vinetrack.planning.predictive_inputs import (
     Band,
     FitNumbers,
@@ -160,8 +159,8 @@ def predict_conditions(
     all_inputs = progress(basis.inputs, "predicting")
     predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
     content = [_json_entry(prediction) for prediction in predictions]
-    several = len(predictions) > 1
-    lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
+    shown = _table_lines(predictions) if len(predictions) > 1 else _condition_lines(predictions[0])
+    lines = [*basis.heading, *shown]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
         titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
@@ -173,7 +172,7 @@ def predict_conditions(
     return lines, content
 
 
-def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
+def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     """Yield all lines about a single condition."""
     inputs = prediction.inputs
     yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
@@ -215,7 +214,7 @@ def _quantity_row(quantity: Band) -> tuple[str, str, str, str, str]:
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
-def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
+def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
     yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
     rows = []
@@ -239,7 +238,7 @@ def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
         yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
 
 
-def _json_entry(prediction: VinePrediction) -> dict[str, Any]:
+def _json_entry(prediction: vines.VinePrediction) -> dict[str, Any]:
     """Return one condition as JSON content, SI."""
     return {
         "condition": prediction.inputs.trial.condition,
@@ -283,7 +282,7 @@ def design_vine(
     check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
     films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",")]
-    room = Room(
+    room = vines.Room(
         films_m=tuple(dict.fromkeys(films_m)),
         diameter_m=read_si_range("diameter_mm", diameter),
         length_m=read_si_range("length_mm", length),
@@ -311,7 +310,7 @@ def design_vine(
     return lines, {"warnings": basis.heading, "films": entries}
 
 
-def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
+def _vine_lines(room: vines.Room, choices: Sequence[vines.Choice]) -> Iterator[str]:
     best = choices[0].prediction
     limits = {"share": room.burst_share, "burst_MPa": room.burst_stress_Pa / 1e6, "kPa": room.pressure_Pa / 1e3}
     yield str(remark("fastest_by", quantity=best.final.name, y_over_L=best.final.y_over_L, **limits))

@@ -83,8 +83,8 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     results, read = Results(folder), read_source_experiment(folder, experiment)
     filmed = [one.name for one in read.trials if one.video is not None]
     if trial not in filmed:
-        existing = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there are none"
-        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {existing}")
+        existing = ", ".join(filmed[:6]) + ", …" * (len(filmed) > 6) or "none"
+        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: there are {existing}")
     of_run = read_json(results.provenance).get("settings") or {}
     asked = {"seconds": seconds} if math.isfinite(seconds) else {}
     return write_overlay(read.trial(trial), results, OverlaySettings(**(of_run.get("overlays") or {}) | asked))

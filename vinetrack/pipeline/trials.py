@@ -32,18 +32,15 @@ from vinetrack.kinematics.summary import TrialError, TrialResult, condition_tabl
 from vinetrack.narrative.diagnosis_text import damping_headline
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.results.folder_layout import (
-    COUNT_COLUMNS,
     KINEMATICS_COLUMNS,
     POINT_COLUMNS,
     STEADY_COLUMNS,
-    TEXT_COLUMNS,
     TRACK_COLUMNS,
     TRIALS_COLUMNS,
-    TRUTH_COLUMNS,
     Results,
-    empty_table,
     read_json,
     read_result,
+    table_of,
 )
 from vinetrack.tracks.importers import load_track, with_pressure_trace
 from vinetrack.video.axis import askew_trials, slope_deg
@@ -153,7 +150,7 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     import pandas as pd
 
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
-    track, kinematics = empty_table(TRACK_COLUMNS), empty_table(KINEMATICS_COLUMNS)
+    track, kinematics = table_of(TRACK_COLUMNS), table_of(KINEMATICS_COLUMNS)
     if summary is not None:
         measured = summary.track
         unmoved, systematic_m = measured.tracked_px, measured.lead_position_systematic_m
@@ -189,9 +186,9 @@ def _draw(
         return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
 
     def strip() -> Figure:
-        if measurement is None:
-            return blank(f"{name}: {reason}")
-        return draw_strip(name, measurement.tracking, measurement.m_per_px)
+        return (
+            draw_strip(name, measurement.tracking, measurement.m_per_px) if measurement else blank(f"{name}: {reason}")
+        )
 
     kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, motion)
     if trial is not None and trial.video is not None:
@@ -207,7 +204,7 @@ def _described(name: str, trial: Trial | None) -> tuple[str, float]:
 def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
     title, ratio = _described(name, trial)
-    windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
+    windows = table_of(STEADY_COLUMNS, read_json(results.analysed(name))["windows"])
     tables = read_result(results.track(name)), read_result(results.kinematics(name))
     return draw_trial_motion(title, *tables, windows, ratio)
 
@@ -233,9 +230,9 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     analysed |= _askew_as_failed(experiment, analysed)
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
-    table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
-    windows = _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
-    points = _frame([content["point"] for content in analysed.values() if content["point"]], POINT_COLUMNS)
+    table = table_of(TRIALS_COLUMNS, [rows[name] for name in experiment.names])
+    windows = table_of(STEADY_COLUMNS, [row for content in analysed.values() for row in content["windows"]])
+    points = table_of(POINT_COLUMNS, [content["point"] for content in analysed.values() if content["point"]])
     evaluated_at = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
     write_csv(results.steady, windows)
     write_csv(results.points, mark_left_out(points))
@@ -259,15 +256,3 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
             row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
             failed[name] = {"row": row, "windows": [], "point": None}
     return failed
-
-
-def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
-    """Return rows, or none, as a table with typed columns; a number that JSON stores as null becomes NaN."""
-    import pandas as pd
-
-    kinds = {
-        column: "Int64" if column in COUNT_COLUMNS else "bool" if column in TRUTH_COLUMNS else "float"
-        for column in columns
-        if column not in TEXT_COLUMNS
-    }
-    return pd.DataFrame(rows, columns=list(columns)).astype(kinds)

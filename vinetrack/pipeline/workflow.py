@@ -255,20 +255,18 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
     problems += model_problems(experiment)
-    facts = {trial.name: found for trial, found in surveyor.facts.items()}
-    trials = [trial for trial in experiment.trials if trial.name in facts]
-    entries, tracks = [facts[trial.name] for trial in trials], []
+    entries, tracks = list(surveyor.facts.values()), []
     for trial in experiment.trials:
         if trial.track is not None:
             with contextlib.suppress(InputError):
                 tracks.append((trial, load_track(trial)))
-    speeds = [(trial, entry.mean_speed_m_s) for trial, entry in zip(trials, entries, strict=True)]
+    speeds = [(trial, entry.mean_speed_m_s) for trial, entry in surveyor.facts.items()]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
     if not any(problem.severity == "error" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
         problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
-    lines = facts_rows(entries, trials) if entries else []
+    lines = facts_rows(entries, list(surveyor.facts)) if entries else []
     if 0 < len(surveyor.looked_into) < len(entries):
         lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")
     notes = list(experiment.blank_notes)

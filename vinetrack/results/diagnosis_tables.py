@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.narrative.verdict_text import estimates_text, listed_names
-from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
+from vinetrack.results.folder_layout import Results, read_diagnosis, read_result, table_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,11 +32,10 @@ class DiagnosisTables:
         self, diagnosis: Diagnosis | None = None, conditions: pd.DataFrame | None = None,
         trials: pd.DataFrame | None = None, tables: Mapping[str, pd.DataFrame] | None = None,
     ) -> None:  # fmt: skip
-        found, none, rounds = tables or {}, empty_table(()), diagnosis.rounds if diagnosis else ()
-        labels: dict[str, str] = {}
-        if conditions is not None:
-            labels = dict(conditions[["condition", "condition_label"]].astype(str).to_numpy())
-        self.trials = empty_table(CURVE_COLUMNS) if trials is None else trials
+        found, none, rounds = tables or {}, table_of(()), diagnosis.rounds if diagnosis else ()
+        named = table_of(("condition", "condition_label")) if conditions is None else conditions
+        labels = dict(zip(named["condition"].astype(str), named["condition_label"].astype(str), strict=True))
+        self.trials = table_of(CURVE_COLUMNS) if trials is None else trials
         worst = worst_condition(self.trials)
         self.worst = labels.get(worst, worst)
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -163,11 +163,16 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
-    """Return a table without rows."""
+def table_of(columns: Sequence[str], rows: Sequence[Mapping[str, Any]] = ()) -> pd.DataFrame:
+    """Return rows, or none, as a table with typed columns; a number that JSON stores as null becomes NaN."""
     import pandas as pd
 
-    return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})
+    kinds = {
+        column: "Int64" if column in COUNT_COLUMNS else "bool" if column in TRUTH_COLUMNS else "float"
+        for column in columns
+        if column not in TEXT_COLUMNS
+    }
+    return pd.DataFrame(rows, columns=list(columns)).astype(kinds)
 
 
 def read_fit(results: Results) -> FitSummary:

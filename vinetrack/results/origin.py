@@ -15,7 +15,7 @@ import platform
 import re
 import time
 from collections.abc import Iterable
-from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,11 +42,9 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
 
 def claim(path: Path) -> dict[str, Any]:
     """Read what a file of the results says of its experiment; empty where there is nothing readable."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    return {}
 
 
 def locked(results: Path) -> FileLock:
@@ -82,13 +80,12 @@ def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
 ) -> dict[str, Any]:
     """Return the content of `provenance.json`: versions, platform, SHA-256 of every input, model, settings."""
-    libraries = {name: name for name in ("numpy", "scipy", "pandas", "numba", "av", "matplotlib")}
-    libraries |= {"opencv-python-headless": "cv2", "scikit-image": "skimage"}
+    libraries = ("numpy", "scipy", "pandas", "numba", "av", "matplotlib", "opencv-python-headless", "scikit-image")
     return {
         "vinetrack": vinetrack.__version__,
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "libraries": {name: import_module(module).__version__ for name, module in libraries.items()},
+        "libraries": {name: version(name) for name in libraries},
         "experiment": experiment.absolute().as_posix(),
         "inputs": {
             (path.relative_to(experiment) if path.is_relative_to(experiment) else path).as_posix(): _hash_file(path)
