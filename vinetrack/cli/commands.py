@@ -219,7 +219,7 @@ def _settings(page: Path | None) -> Answer | None:
 @command()
 def _effects(name: str | None, experiment: Path | None) -> Answer:
     """List all effects with formulas, parameters and units, or explain one."""
-    from vinetrack.effects import KINDS, catalogue, find_effect, own_effects
+    from vinetrack.effects import catalogue, find_effect, own_effects
     from vinetrack.experiment.settings import read_experiment_settings
     from vinetrack.pipeline.workflow import find_experiment
 
@@ -227,7 +227,7 @@ def _effects(name: str | None, experiment: Path | None) -> Answer:
     listed = () if experiment is None else read_experiment_settings(folder / "experiment.yaml").effects
     own = own_effects([safe_join(folder, path) for path in listed])
     if name is None:
-        effects = sorted({**catalogue(), **own}.values(), key=lambda one: KINDS.index(one.kind))
+        effects = list({**catalogue(), **own}.values())
         parameters = [", ".join(f"{p.symbol} ({p.unit})" for p in one.parameters) or "–" for one in effects]
         kinds = [f"{one.kind}, own" if one.name in own else one.kind for one in effects]
         entries = zip((one.name for one in effects), kinds, parameters, strict=True)

@@ -7,7 +7,7 @@ own, `own_effects(paths)` all of them, tried out.
 from __future__ import annotations
 
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import (
     EffectError,
     catalogue,
@@ -20,7 +20,6 @@ from vinetrack.effects._catalogue import (
 __all__ = [
     "BASE_EFFECTS",
     "HOOKS",
-    "KINDS",
     "REFERENCE_TRIAL",
     "Effect",
     "EffectError",
@@ -43,7 +42,3 @@ def __getattr__(name: str) -> Effect:
         return catalogue()[name]
     except KeyError:
         raise AttributeError(f"there is no effect named {name!r}") from None
-
-
-def __dir__() -> list[str]:
-    return [*__all__, *catalogue()]

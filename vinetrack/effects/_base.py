@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from vinetrack.core.records import Trial
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
@@ -42,8 +42,6 @@ HOOKS: Mapping[str, str | float] = {
 """Quantities that an effect may change, in the order in which the model evaluates them (see `Effect`), each with what
 its function returns where the effect vanishes: a field of the state, or a number.
 """
-
-KINDS = ("base", "physical", "measurement")
 
 
 class State(NamedTuple):
@@ -223,7 +221,7 @@ class Effect:
     """
 
     name: str
-    kind: str = "physical"
+    kind: Annotated[str, Field(pattern="^(base|physical|measurement)$")] = "physical"
     summary: str
     text: str
     parameters: tuple[Parameter, ...] = ()

@@ -13,7 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
@@ -24,7 +24,7 @@ from vinetrack.core.problems import UserError
 from vinetrack.core.records import Bend, Trial
 from vinetrack.core.tables import file_size, write_text
 from vinetrack.core.units import BASE_EFFECTS, split_unit
-from vinetrack.effects._base import HOOKS, KINDS, REFERENCE_TRIAL, Effect, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, State, TrialInputs, Worked
 
 # ------------------------------------------------------------------------------
 # First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash.
@@ -74,10 +74,9 @@ def _load_module(path: Path) -> ModuleType:
     name = f"vinetrack_effect_{path.stem}_{hashlib.sha256(text).hexdigest()[:12]}"
     if name not in sys.modules:
         tree = ast.parse(text)
-        imports = [node.names for node in ast.walk(tree) if isinstance(node, ast.Import)]
-        imported = {alias.name.split(".")[0] for names in imports for alias in names}
-        imported |= {(n.module or ".").split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-        if foreign := sorted(imported.difference(_IMPORTED.split())):
+        imported = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+        imported += [node.module or "." for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        if foreign := sorted({name.split(".")[0] for name in imported}.difference(_IMPORTED.split())):
             known = ", ".join(_IMPORTED.split()[1:])
             raise EffectError(f"{path}: imports {', '.join(foreign)}, but an effect may only import {known}.")
         module = ModuleType(name)
@@ -93,16 +92,15 @@ def load_effect(path: Path | str) -> Effect:
     path = Path(path)
     try:
         file_size(path)
-    except FileNotFoundError:
-        raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.") from None
-    except OSError as error:
-        raise EffectError(f"{path}: this effect cannot be read: {error.strerror}.") from None
-    announce(path)
-    try:
+        announce(path)
         effect = _effect_of(_load_module(path), path)
         faults = list(_faults(effect))
     except EffectError:
         raise
+    except FileNotFoundError:
+        raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.") from None
+    except OSError as error:
+        raise EffectError(f"{path}: this effect cannot be read: {error.strerror}.") from None
     except ValidationError as error:
         faults = [f"{' '.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
     except Exception as error:
@@ -129,20 +127,15 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
         "path": path.resolve(),
         "breakpoints": breakpoints,
     }
-    effect: Effect = _adapter().validate_python(given)
-    return effect
+    return _adapter().validate_python(given)
 
 
-@lru_cache(maxsize=1)
-def _adapter() -> TypeAdapter[Effect]:
-    return TypeAdapter(Effect)
+_adapter = cache(lambda: TypeAdapter(Effect))  # made when first used: it takes a while
 
 
 def _faults(effect: Effect) -> Iterable[str]:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", effect.name):
         yield "the file's name is the effect's name and must be lower_case"
-    if effect.kind not in KINDS:
-        yield f"KIND is {effect.kind!r}, must be one of {', '.join(KINDS)}"
     if not effect.functions:
         yield f"defines none of the functions {', '.join(HOOKS)}"
     if not effect.text or not effect.formula:
@@ -201,8 +194,7 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
         effect = load_effect(path)
         if effect.name in effects:
             raise EffectError(f"{path}: there is another effect named {effect.name!r}, {effects[effect.name].path}.")
-        fault = next(behaviour_faults(effect), None)
-        if fault is not None:
+        for fault in behaviour_faults(effect):
             raise EffectError(f"{path}: {fault}.")
         effects[effect.name] = effect
     return effects
@@ -231,10 +223,8 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
         state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
         rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
         values = {parameter.name: parameter.default for parameter in effect.parameters}
-        if unknown := set(worked.parameters) - set(values):
-            raise ValueError(f"there is no parameter {', '.join(sorted(unknown))}")
         value = float(effect.functions[worked.hook](state, rig, *(values | dict(worked.parameters)).values()))
-    except (KeyError, ValueError, ArithmeticError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         yield f"{worked.hook} cannot be tried ({error}): {worked.how}"
         return
     if not math.isclose(value, worked.expected, rel_tol=worked.rel, abs_tol=1e-12):
