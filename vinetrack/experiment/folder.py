@@ -389,8 +389,6 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
 # A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
 # rises with the order, the data cannot distinguish such a drift from an effect of pressure.
 
-CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
-
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     """Return the rank of every trial, from 0, as they were run, shape (n_trials,), and whether the sheet says so."""
@@ -420,7 +418,8 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
     from pandas import DataFrame
 
     correlation = order_pressure_correlation(trials)
-    if abs(correlation) >= CONFOUNDING_CORRELATION:
+    # 0.7: rank correlation above which order and pressure count as confounded (derived)
+    if abs(correlation) >= 0.7:
         message = (
             f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
             if trial_order(trials)[1]
