@@ -49,7 +49,7 @@ BUDGETS = {
 """Lines, files and module-level constants that a room may have, lowered with the code and never raised. The files of
 single effects do not count: a new effect is free."""
 
-HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
+HEAVY = {"matplotlib", "cv2", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
 HEAVY_AT_IMPORT = {
     *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis"),
     *("planning", "paper", "interface", "pages"),

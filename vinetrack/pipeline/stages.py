@@ -197,7 +197,7 @@ class Kept:
         """The tracking in pixels of a recording (the first input is its path), kept or made."""
         film, *others = inputs
         assert isinstance(film, Path)
-        libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2", "skimage")]
+        libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2")]
         code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
         state = (code, libraries, film.resolve(), identity(film), others)
         self.tracked = _key(*state)

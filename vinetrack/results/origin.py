@@ -80,7 +80,7 @@ def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
 ) -> dict[str, Any]:
     """Return the content of `provenance.json`: versions, platform, SHA-256 of every input, model, settings."""
-    libraries = ("numpy", "scipy", "pandas", "numba", "av", "matplotlib", "opencv-python-headless", "scikit-image")
+    libraries = ("numpy", "scipy", "pandas", "numba", "av", "matplotlib", "opencv-python-headless")
     return {
         "vinetrack": vinetrack.__version__,
         "python": platform.python_version(),

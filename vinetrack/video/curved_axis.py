@@ -1,19 +1,17 @@
-"""Find the curve along which a vine grew, from the region of pixels that changed.
+"""Find the curve along which a vine grew, from the pixels that changed, in the order in which they did.
 
-A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end that
-changed first to the end that changed last, is the path. The curve is used only where its front share is far larger than
-that of the best straight line.
+A pixel that the vine covers changes once. Those that change at about the same time lie across the vine at its tip: the
+smoothed line through their middles is the path. The curve is used only where its front share is larger than that of the
+best straight line, or as large in a narrower band.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats
 from vinetrack.video.axis import (
     LEAST_FRONT_SHARE,
     Axis,
@@ -62,22 +60,19 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
 
 
 def find_growth_axis(small: SmallPictures) -> Axis:
-    """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change."""
+    """Find the growth axis from the motion: a straight line, or a curve where that explains more of the change."""
     straight: Axis | RecordingError
     try:
         straight = find_axis(small)
     except RecordingError as error:
         straight = error
-    band = _changed_band(small)
-    line_share = front_share_of_picture(small, straight) if isinstance(straight, Axis) else 0.0
-    # 1.25, 0.98, 1.35: a curve is used where the straight line needs a band this many times wider and the curve
-    # explains at least this part of what the line does, else where it explains this many times as much (measured)
-    line_too_wide = isinstance(straight, Axis) and band and straight.width_px > 1.25 * band.width * small.factor
-    gain = 0.98 if line_too_wide else 1.35
-    # No curve can explain more than all of the change: along a straight vine none is searched.
-    curve = find_curve(small, band) if line_too_wide or line_share * gain < 1 else None
-    if curve is not None:
-        needed = max(LEAST_FRONT_SHARE, line_share * gain)
+    if (curve := find_curve(small)) is not None:
+        # 1.25, 0.98, 1.35: a curve is used where the straight line needs a band this many times wider and the curve
+        # explains at least this part of what the line does, else where it explains this many times as much (measured)
+        needed = LEAST_FRONT_SHARE
+        if isinstance(straight, Axis):
+            gain = 0.98 if straight.width_px > 1.25 * curve.width_px else 1.35
+            needed = max(needed, gain * front_share_of_picture(small, straight))
         if front_share_of_picture(small, curve) >= needed and front_share(small, curve) >= LEAST_FRONT_SHARE:
             return curve
     if isinstance(straight, RecordingError):
@@ -87,32 +82,43 @@ def find_growth_axis(small: SmallPictures) -> Axis:
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
     """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
-    if len(small.grown.x) < 12:
-        return 0.0
     along, band = along_axis(small, small.grown, axis), max(0.6 * axis.width_px / small.factor, 2.0)
     return share_on_front(along, band) if (np.abs(along.y) < band).any() else 0.0
 
 
-def find_curve(small: SmallPictures, band: Band | None = None) -> Axis | None:
-    """Find the smoothed middle of the band that changed, from its first change to its last."""
-    band = band or _changed_band(small)
-    # 3.0: least length of the band, in its widths, that has a path (chosen)
-    if band is None or len(path := _centreline(band)) < 3.0 * band.width:
+def find_curve(small: SmallPictures) -> Axis | None:
+    """Find the smoothed line through the middles of what grew in turn, from the first change to the last."""
+    from scipy.interpolate import make_smoothing_spline
+    from scipy.spatial import KDTree
+
+    # 25, 4: parts of the growth, of as many pixels each, and fewest pixels of a part (chosen)
+    n_parts = 25
+    if len(small.grown.x) < 4 * n_parts:
         return None
-    # Turned round where its pixels changed from its end to its beginning
-    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
-    finite = np.flatnonzero(np.isfinite(times))
-    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
-    # 1.5: distance of the curve's knots in widths of the band (chosen)
-    middle = _smoothed_knots(path if trend >= 0 else path[::-1], max(1.5 * band.width, 6.0))
-    if middle is None:
+    grown, part = np.column_stack([small.grown.x, small.grown.y]), np.arange(n_parts)
+    order = np.argsort(small.grown.time, kind="stable")
+    change = np.cumsum(small.grown.weight[order])
+    in_turn = np.split(grown[order], np.searchsorted(change, part[1:] / n_parts * change[-1]))
+    # 8: length in parts of a wave that is damped to a half (chosen): penalty λ k⁴ = 1 at k = 2π / 8.
+    splines = [
+        make_smoothing_spline(part, middles, lam=(8 / (2 * np.pi)) ** 4)
+        for middles in np.transpose([np.median(places, axis=0) for places in in_turn])
+    ]
+    path = np.column_stack([spline(np.linspace(0, n_parts - 1, 20 * n_parts)) for spline in splines])
+    # 0.9: part of the pixels that lie within the width (chosen)
+    along, width = length_along(path), 2 * float(np.quantile(KDTree(path).query(grown)[0], 0.9)) + 1
+    # 3.0: least length of a curve, in its widths (chosen)
+    if along[-1] < 3.0 * width:
         return None
+    # 1.5: distance of the curve's knots in widths (chosen)
+    knots = np.linspace(0.0, along[-1], max(4, round(along[-1] / max(1.5 * width, 6.0)) + 1))
+    middle = np.column_stack([np.interp(knots, along, places) for places in path.T])
     size = small.shape[1], small.shape[0]
     try:
         middle_px = (middle + 0.5) * small.factor - 0.5
-        axis = axis_through(middle_px, band.width * small.factor)
+        axis = axis_through(middle_px, width * small.factor)
         # Continued straight at both ends, as far as the picture goes
-        knots, margin = [*middle_px], (3 * band.width + 12) * small.factor
+        knots, margin = [*middle_px], (3 * width + 12) * small.factor
         for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
             extension = axis.points(end + sign * np.arange(1.0, margin + 1))
             inside = ((extension >= 0) & (extension <= np.array(size) - 1)).all(axis=1)
@@ -125,72 +131,3 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> Axis | None:
     if not axis.bends or curve_problem(axis, axis.width_px / 2, size):
         return None
     return axis
-
-
-@dataclass(frozen=True)
-class Band:
-    """What changed in the small pictures, in their pixels; arrays of shape (height, width). `region` is its largest
-    connected part, `depth` the distance from the border of that, `when` the time of change, NaN where nothing changed;
-    `width` is the width along most of its length.
-    """
-
-    region: Bools
-    depth: Floats
-    when: Floats
-    width: float
-
-
-def _changed_band(small: SmallPictures) -> Band | None:
-    """The largest connected region that changed; None where hardly anything does."""
-    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt, label
-
-    if len(small.grown.x) < 12:
-        return None
-    when = np.full(small.frames.shape[1:], np.nan)
-    when[small.grown.y.astype(int), small.grown.x.astype(int)] = small.grown.time
-    # With gaps closed and threads removed
-    region = np.isfinite(when)
-    closed = binary_closing(np.pad(region, 3), iterations=2)[3:-3, 3:-3]
-    parts, count = label(binary_opening(binary_fill_holes(closed), iterations=1), np.ones((3, 3)))
-    if count:
-        region = np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
-    depth = np.asarray(distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1])
-    half = float(np.quantile(depth[region], 0.9))
-    return Band(region, depth, when, 2 * half + 1)
-
-
-def _centreline(band: Band) -> Floats:
-    """Pixels (x, y) of the cheapest path along the middle of a band between its two most distant ends, shape (n, 2)."""
-    from skimage.graph import MCP_Geometric
-
-    rows, columns = np.nonzero(band.region)
-    blocked = np.full(band.region.shape, -1.0)
-    unit_costs = np.where(band.region, 1.0, blocked)
-    start = end = int(rows[0]), int(columns[0])
-    for _ in range(2):
-        costs = np.where(band.region, MCP_Geometric(unit_costs).find_costs([end])[0], -1.0)
-        row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(costs), costs, -1.0))), costs.shape)
-        start, end = end, (int(row), int(column))
-    # 3.0: how strongly the path through the band keeps to its middle: a step costs 1 / depth³ (chosen)
-    paths = MCP_Geometric(np.where(band.region, 1 / np.maximum(band.depth, 0.5) ** 3.0, blocked))
-    paths.find_costs([start], [end])
-    return np.array(paths.traceback(end), dtype=float)[:, ::-1]
-
-
-def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
-    """Knots `spacing` from each other of a penalised spline through a path of whole pixels, shape (n, 2), n ≥ 4. The
-    ends of the path run into the corners of the band: half a knot distance at each is left out. None where fewer than
-    five pixels remain between them, the fewest that a cubic spline goes through.
-    """
-    from scipy.interpolate import make_smoothing_spline
-
-    along = length_along(path)
-    inner = (along >= spacing / 2) & (along <= along[-1] - spacing / 2)
-    if inner.sum() < 5:
-        return None
-    # A wave of the length of two knot distances is damped to a half: penalty λ k⁴ = 1 at k = π / spacing.
-    penalty = (spacing / np.pi) ** 4
-    splines = [make_smoothing_spline(along[inner], path[inner, k], lam=penalty) for k in (0, 1)]
-    count = max(4, round(np.ptp(along[inner]) / spacing) + 1)
-    knots = np.linspace(along[inner][0], along[inner][-1], count)
-    return np.stack([spline(knots) for spline in splines], axis=1)
