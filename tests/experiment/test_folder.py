@@ -25,6 +25,7 @@ from vinetrack.experiment.settings import (
     setting_entries,
 )
 from vinetrack.pipeline.workflow import model_problems
+from vinetrack.video.survey import in_no_row
 
 
 @pytest.fixture
@@ -207,13 +208,13 @@ def test_check_names_the_trial_whose_track_is_wrong(folder):
         assert (problem.severity, problem.trial, problem.column) == ("error", "b", "track")
 
 
-def filmed(folder: Path, videos: dict[str, str], files: Iterable[str], settings: str = "") -> Path:
-    """A sheet of recordings by trial, and the files that are there."""
+def filmed(folder: Path, videos: dict[str, str], files: Iterable[str], settings: str = "", aside: str = "") -> Path:
+    """A sheet of recordings by trial, that one put aside, and the files that are there."""
     for name in files:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(b"film")
-    rows = [f"{name},{video},24,200,280,28,3,\n" for name, video in videos.items()]
-    return write(folder, f"{HEADER.replace('track', 'video')}\n{''.join(rows)}", settings)
+    rows = [f"{name},{video},24,200,280,28,3,,{'no' * (name == aside)}\n" for name, video in videos.items()]
+    return write(folder, f"{HEADER.replace('track', 'video')},use\n{''.join(rows)}", settings)
 
 
 def test_check_looks_at_videos_and_calls_who_can_open_them(folder):
@@ -240,6 +241,19 @@ def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder):
     filmed(folder, videos, ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"), "capture_fps: 1000\n")
     remedies = {problem.trial: problem.remedy for problem in check_experiment(folder) if problem.trial}
     assert remedies == {"b": "did you mean d12_24kPa_2.MP4?", "c": "check the path and its upper and lower case"}
+
+
+def test_a_recording_that_no_row_names_is_named(folder):
+    files = ["a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4"]
+    files += [f"burst/{i}.png" for i in range(5)]
+    target = "calibration: {kind: checkerboard, image: target.mp4, squares: [5, 5], square_mm: 5}\n"
+    videos = {"a": "./a.mp4", "b": "left.mov"}
+    filmed(folder, videos, files, "capture_fps: 1000\n" + target, aside="b")
+    (problem,) = in_no_row(read_experiment(folder))
+    assert (problem.severity, problem.file, problem.column) == ("warning", "trials.csv", "video")
+    assert problem.message.endswith(" burst, day 2/extra.avi")
+    filmed(folder, videos | {"c": "burst/0.png", "d": "day 2/extra.avi"}, files, "capture_fps: 1000\n" + target, "b")
+    assert in_no_row(read_experiment(folder)) == []
 
 
 def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder):

@@ -45,6 +45,7 @@ class Experiment:
     lines: dict[str, int] = field(default_factory=dict)
     angle_blank: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
+    recordings: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -142,6 +143,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         lines={row.name: row.line for row in rows},
         angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
         columns=table.columns if table else (),
+        recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
 
 

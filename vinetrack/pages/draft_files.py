@@ -32,55 +32,7 @@ from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import SHEET
-
-# ------------------------------------------------------------------------------
-# Recordings that lie in the folder.
-
-MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
-
-
-def list_recordings(folder: Path, depth: int = 4) -> list[str]:
-    """Return the recordings below a folder, as relative paths in natural order."""
-    # 4: levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
-    found = []
-    for path in entries(folder):
-        if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
-            found.append(path.name)
-        elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
-            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= MIN_PICTURES:
-                found.append(path.name)
-            elif depth > 0:
-                found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
-    return sorted(found, key=natural_order)
-
-
-def entries(folder: Path) -> list[Path]:
-    """Return what a folder holds, without hidden files; nothing if it cannot be read."""
-    try:
-        return [path for path in folder.iterdir() if not path.name.startswith(".")]
-    except OSError:
-        return []
-
-
-def is_calibration(folder: Path) -> bool:
-    """Whether a folder's name says that it holds pictures of a target."""
-    return folder.name.lower().startswith("calib")
-
-
-def _is_stack(path: Path) -> bool:
-    """Whether a TIFF holds as many pictures as a recording needs."""
-    from PIL import Image
-
-    if path.suffix.lower() in (".tif", ".tiff"):
-        with suppress(OSError), Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= MIN_PICTURES
-    return False
-
-
-def natural_order(text: str) -> list[Any]:
-    """Sort key that orders numbers in a name by value: 2 before 10."""
-    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", text))]
-
+from vinetrack.video.survey import MIN_PICTURES, entries, is_calibration, list_recordings, natural_order
 
 # ------------------------------------------------------------------------------
 # A quantity has one column in a table, in whichever unit.

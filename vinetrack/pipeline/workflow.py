@@ -246,7 +246,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import load_track
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
-    from vinetrack.video.survey import Surveyor, facts_entry, facts_rows
+    from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
     surveyor = Surveyor(keep)
     problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor)]
@@ -254,7 +254,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
-    problems += model_problems(experiment)
+    problems += [*in_no_row(experiment), *model_problems(experiment)]
     entries, tracks = list(surveyor.facts.values()), []
     for trial in experiment.trials:
         if trial.track is not None:

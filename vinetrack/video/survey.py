@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,10 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import PictureAxis, Trial
+from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, PictureAxis, Trial
+from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
+from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
@@ -135,6 +139,70 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     except ValueError:
         return axis
     return axis if outlined is None else outlined[0].axis
+
+
+# ------------------------------------------------------------------------------
+# Recordings that lie in the folder.
+
+MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
+
+
+def list_recordings(folder: Path, depth: int = 4) -> list[str]:
+    """Return the recordings below a folder, as relative paths in natural order."""
+    # 4: levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
+    found = []
+    for path in entries(folder):
+        if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
+            found.append(path.name)
+        elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
+            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= MIN_PICTURES:
+                found.append(path.name)
+            elif depth > 0:
+                found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
+    return sorted(found, key=natural_order)
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what a folder holds, without hidden files; nothing if it cannot be read."""
+    try:
+        return [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def is_calibration(folder: Path) -> bool:
+    """Whether a folder's name says that it holds pictures of a target."""
+    return folder.name.lower().startswith("calib")
+
+
+def _is_stack(path: Path) -> bool:
+    """Whether a TIFF holds as many pictures as a recording needs."""
+    from PIL import Image
+
+    if path.suffix.lower() in (".tif", ".tiff"):
+        with contextlib.suppress(OSError), Image.open(path) as image:
+            return getattr(image, "n_frames", 1) >= MIN_PICTURES
+    return False
+
+
+def natural_order(text: str) -> list[Any]:
+    """Sort key that orders numbers in a name by value: 2 before 10."""
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", text))]
+
+
+def in_no_row(experiment: Experiment) -> list[Problem]:
+    """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
+    written = (*experiment.recordings, *(path for _, path in experiment.settings.paths))
+    named = {Path(os.path.normpath(path.replace("\\", "/"))) for path in written}
+    named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
+    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in SIDE_FILES}
+    found = [name for name in list_recordings(experiment.folder) if Path(name) not in named]
+    if not found:
+        return []
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    message = f"names no trial for {', '.join(found[:5])}{more}"
+    remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
+    return [Problem("in_no_row", message, "video", file=SHEET, severity="warning", remedy=remedy)]
 
 
 # ------------------------------------------------------------------------------
