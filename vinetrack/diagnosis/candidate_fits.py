@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
 )
 from vinetrack.diagnosis.score_test import CandidateShape
-from vinetrack.dynamics.model import Value
+from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
@@ -60,18 +60,13 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
 
 
-def full_fit(before: Fit, shape: CandidateShape, size: float, best: float) -> Fit | None:
-    """Fit a model with an effect added, from a shape at its predicted size; None where the fit fails. `best` is the
-    largest ln L of the others: a fit that stays far behind it is given up.
+def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf, **how: Any) -> Fit | None:
+    """Refit with another model, or other options of `refit`; None where the fit fails. `best` is the largest ln L of
+    other hypotheses: a fit that stays far behind it, or far off the tracks, is given up.
     """
     try:
         # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
-        fit = refit(
-            before,
-            before.model.with_effects((shape.effect,)),
-            start=start_values(shape, size),
-            most_iterations=14,
-        )
+        fit = refit(before, model, most_iterations=14, **how)
         if fit.converged or fit.log_likelihood < best - 50.0 or is_poor_fit(fit.predictor, fit.solution):
             return fit
         return refit(fit, most_iterations=40)
@@ -187,7 +182,8 @@ class CandidateFits:
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = [known for known in self.fitted.values() if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
-            fit = full_fit(self.tests.fit, shape, size, best)
+            model = self.tests.fit.model.with_effects((shape.effect,))
+            fit = full_fit(self.tests.fit, model, start=start_values(shape, size), best=best)
             hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, (shape.effect,), fit)
             if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:
                 self.failed.add(name)

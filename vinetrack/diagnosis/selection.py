@@ -25,6 +25,7 @@ from vinetrack.diagnosis.candidate_fits import (
     CandidateFits,
     Report,
     drop_curves,
+    full_fit,
     with_curves,
 )
 from vinetrack.diagnosis.likelihood_ratio import (
@@ -357,12 +358,9 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
         return None
     report("letting the tail go slack")
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
-    try:
-        slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
-        after = refit(slack, afresh=has_excess_scatter(fit))
-    except (FitError, SimulationError, np.linalg.LinAlgError):
-        return None
-    return likelihood_ratio(fit, (TAIL_SLACK,), after)
+    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
+    after = full_fit(slack, afresh=has_excess_scatter(fit))
+    return None if after is None else likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
 @dataclass(frozen=True)

@@ -384,7 +384,8 @@ def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, 
     variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
     trials = [trial_data.trial for trial_data in predictor.data]
     for groups in (range(len(trials)), coarsest_groups(trials)):
-        by_scatter = scatter_variances(*(_summed_over(groups, each) for each in (information, scores)), problem, plain)
+        summed = _summed_over(groups, information), _summed_over(groups, scores)
+        by_scatter = scatter_variances(*summed, problem, plain)
         larger = by_scatter[0] > variance
         variance, degrees = (
             np.where(larger, new, old) for new, old in zip(by_scatter, (variance, degrees), strict=True)
