@@ -95,8 +95,8 @@ def solve_from(
 def _solve_or_alike(
     predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
-    """Solve, and where the fit is poor, once more with trials that are alike: differences between them in pressure and
-    B take up what a model lacks, and n is meaningless then. If that leads near the tracks, trials may differ again.
+    """Solve, and where the fit is poor, with trials that are alike: differences between them in pressure and B take up
+    what a model lacks, and n is meaningless then. From there trials may differ again, if that leads near the tracks.
     """
     solution = solve(predictor, problem, state, fixed_terms, **how)
     if fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
@@ -104,9 +104,8 @@ def _solve_or_alike(
     # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
     try:
         alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
-        if is_poor_fit(predictor, alike):
-            return alike
-        return solve(predictor, problem, alike.state, fixed_terms, **how)
+        solution = solve(predictor, problem, alike.state, fixed_terms, **how)
+        return alike if is_poor_fit(predictor, solution) else solution
     except SimulationError:
         return solution
 
