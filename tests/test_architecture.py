@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (694, 4, 5),
     "core": (1064, 7, 26),
-    "diagnosis": (6852, 20, 95),
+    "diagnosis": (6846, 20, 95),
     "dynamics": (2323, 8, 26),
     "effects": (574, 3, 7),
     "experiment": (1599, 5, 17),
