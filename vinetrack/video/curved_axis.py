@@ -118,14 +118,14 @@ def find_curve(small: SmallPictures) -> Axis | None:
         middle_px = (middle + 0.5) * small.factor - 0.5
         axis = axis_through(middle_px, width * small.factor)
         # Continued straight at both ends, as far as the picture goes
-        knots, margin = [*middle_px], (3 * width + 12) * small.factor
+        through, margin = [*middle_px], (3 * width + 12) * small.factor
         for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
             extension = axis.points(end + sign * np.arange(1.0, margin + 1))
             inside = ((extension >= 0) & (extension <= np.array(size) - 1)).all(axis=1)
             count = len(extension) if inside.all() else int(np.argmin(inside))
             if count > 6:
-                knots.insert(0 if sign < 0 else len(knots), extension[count - 1])
-        axis = axis_through(knots, axis.width_px)
+                through.insert(0 if sign < 0 else len(through), extension[count - 1])
+        axis = axis_through(through, axis.width_px)
     except RecordingError:
         return None
     if not axis.bends or curve_problem(axis, axis.width_px / 2, size):
