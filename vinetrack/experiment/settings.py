@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, Union, get_args, g
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
-from pydantic.functional_validators import AfterValidator, field_validator, model_validator
+from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
@@ -28,8 +28,9 @@ from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, spli
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, did_you_mean, read_range
 
 InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
-Number = Annotated[float, Field(strict=True)]  # neither text nor yes and no, which pydantic would convert to 1 and 0
-Count = Annotated[int, Field(strict=True)]
+NoTruth = BeforeValidator(lambda value: str(value) if isinstance(value, bool) else value)  # yes and no are no 1 and 0
+Number = Annotated[float, NoTruth]
+Count = Annotated[int, NoTruth]
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
 Pixel = tuple[Number, Number]

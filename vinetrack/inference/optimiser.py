@@ -254,9 +254,12 @@ def solve(
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
-        state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms)
+        # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
+        # 1e3, 9: predicted decrease of −2 ln L from which a fit is far off, and how many steps at most (chosen)
+        far_off = predicted_decrease > 1e3 and iteration <= 9
+        state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
         if state.rho == CORRELATIONS[-1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
-            break  # Noise and differences between trials have taken up what the model lacks.
+            break  # They have taken it up.
         variances_moved = variance_change(before, state)
         damping_before = damping
         (step, effect_step, predicted_decrease), damping = _next_step(
@@ -279,7 +282,7 @@ def solve(
                 searches_left, searched_in_vain = searches_left - 1, False
                 continue
             searches_left = 0 if small_step else searches_left
-        if small_step and variances_moved < CONVERGED_VARIANCES:
+        if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
             converged = True
             break
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
@@ -340,12 +343,14 @@ def update_variances(
     state: FitState,
     estimable_sd: tuple[bool, bool],
     fixed_terms: FixedTerms,
+    *,
+    far_off: bool = False,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations."""
+    """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
     if fixed_terms.noise is None:
-        rho, variance = estimate_noise(cross_products, problem, state)
+        rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if any(estimable_sd):
+    if any(estimable_sd) and not far_off:
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
         state = replace(state, spread=spread)
     return state
