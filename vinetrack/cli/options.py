@@ -212,11 +212,15 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
             return COLUMNS[line["field"]].read(given)
         except InputError as error:
             raise _refused(line, f"{given!r} {error.message}: {error.allowed or error.remedy}") from None
-    if kind == "json" and given is not None:
+    if kind in ("list", "object") and given is not None:
         try:
-            return json.loads(given)
+            content = json.loads(given)
         except ValueError as error:
             raise _refused(line, f"is not JSON ({error})") from None
+        type_, example = (list, '["t1", "t2"]') if kind == "list" else (dict, '{"damping": {"seed": 7}}')
+        if not isinstance(content, type_):
+            raise _refused(line, f"is not a JSON {kind} such as {example}")
+        return content
     return given
 
 

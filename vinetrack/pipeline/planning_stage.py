@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Trial
-from vinetrack.core.tables import PROVENANCE, write_csv
+from vinetrack.core.tables import PROVENANCE, safe_join, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
@@ -27,7 +27,7 @@ from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
-from vinetrack.effects import BASE_EFFECTS, catalogue
+from vinetrack.effects import BASE_EFFECTS, catalogue, own_effects
 from vinetrack.experiment.folder import (
     REQUIRED_FOR_PREDICTION,
     Experiment,
@@ -36,7 +36,7 @@ from vinetrack.experiment.folder import (
     read_experiment,
 )
 from vinetrack.experiment.schema import COLUMNS, option, read_range
-from vinetrack.experiment.settings import Limits
+from vinetrack.experiment.settings import Limits, read_experiment_settings
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import check_figure, write_figure
@@ -131,7 +131,9 @@ def read_basis(
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
     user_effects = planned.user_effects
     if fit is not None and not set(fit.fit.names) <= set(catalogue()):
-        user_effects = read_source_experiment(Path(fit.source)).user_effects
+        folder = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
+        paths = read_experiment_settings(folder / "experiment.yaml").effects
+        user_effects = own_effects([safe_join(folder, path) for path in paths])
     read = [read_sizes(text, user_effects) for text in effects]
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
