@@ -146,6 +146,17 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     assert np.max(by_day / alone) > 1.2
 
 
+def test_the_scatter_of_scores_is_not_less_for_the_numbers_that_were_fitted_to_them():
+    """What ten polynomials leave of 24 values has Σ e² = 14 σ² on average; the variance of a sum of 24 is 24 σ²."""
+    draw, seen = np.random.default_rng(11), []
+    columns = np.polynomial.legendre.legvander(np.linspace(-1, 1, 24), 9)
+    left = np.eye(24) - columns @ np.linalg.pinv(columns)
+    for _ in range(500):
+        single = (left @ draw.standard_normal(24))[:, None]
+        seen.append(errors.group_scatter(single, range(24), 10)[0])
+    assert np.mean(seen) == pytest.approx(24, rel=0.06)
+
+
 @pytest.mark.parametrize("trials", [5, 7])
 def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_interval(trials):
     """Replicates of one condition whose B scatters by far more than any is measured: Student's problem."""
