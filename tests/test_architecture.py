@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (574, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 34),
-    "inference": (5713, 14, 51),
+    "inference": (5714, 14, 51),
     "interface": (601, 2, 2),
     "kinematics": (1730, 6, 12),
     "laboratory": (1600, 6, 9),

@@ -242,6 +242,7 @@ def solve(
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
     state = _with_fixed_terms(state, fixed_terms)
+    far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
     damping, converged, iteration, predicted_decrease = 0.0, False, 0, math.inf
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
@@ -255,8 +256,8 @@ def solve(
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
         # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
-        # 1e3, 9: predicted decrease of −2 ln L from which a fit is far off, and how many steps at most (chosen)
-        far_off = predicted_decrease > 1e3 and iteration <= 9
+        # 9: steps at most in which a fit counts as far off (chosen)
+        far_off = predicted_decrease > far_decrease and iteration <= 9
         state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
         if state.rho == CORRELATIONS[-1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
             break  # They have taken it up.
@@ -294,7 +295,7 @@ def solve(
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
             # step should gain much, it is no minimum, but nothing more can be done.
             if variances_moved < CONVERGED_VARIANCES:
-                converged = predicted_decrease < 1e3  # of −2 ln L (chosen)
+                converged = predicted_decrease < far_decrease
                 break
             continue
         try:

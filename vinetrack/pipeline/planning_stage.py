@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Trial
-from vinetrack.core.tables import PROVENANCE, safe_join, write_csv
+from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
@@ -27,7 +27,7 @@ from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
-from vinetrack.effects import BASE_EFFECTS, catalogue, own_effects
+from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment.folder import (
     REQUIRED_FOR_PREDICTION,
     Experiment,
@@ -132,8 +132,8 @@ def read_basis(
     user_effects = planned.user_effects
     if fit is not None and not set(fit.fit.names) <= set(catalogue()):
         folder = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
-        paths = read_experiment_settings(folder / "experiment.yaml").effects
-        user_effects = own_effects([safe_join(folder, path) for path in paths])
+        settings = read_experiment_settings(folder / "experiment.yaml")
+        user_effects = replace(planned, folder=folder, settings=settings).user_effects
     read = [read_sizes(text, user_effects) for text in effects]
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
