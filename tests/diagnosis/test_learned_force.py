@@ -156,6 +156,7 @@ def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False))
 
 
+@pytest.mark.slow
 def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path):
     patch = laws_of(tmp_path, "patch", -0.4, 91)
     best = patch.laws.iloc[0]

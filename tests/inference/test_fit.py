@@ -25,7 +25,7 @@ from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
-from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
+from vinetrack.inference.trial_effects import residuals_in, trial_costs, white_at_releases
 
 
 @pytest.fixture(scope="module")
@@ -461,17 +461,16 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion,
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho):
+def test_columns_at_a_release_are_the_shifted_and_whitened_ones(rho):
     draw = np.random.default_rng(5)
     time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
     curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
     first, releases_s = np.isin(np.arange(41), [0, 17]), np.array([-0.2, 0.0, 0.013, 0.25])
-    products = products_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
-    for release_s, product in zip(releases_s, products, strict=True):
+    columns_at = white_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
+    for release_s, at in zip(releases_s, columns_at, strict=True):
         columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
         columns[:, -1] = position_m - columns[:, -1]
-        white = whiten(columns, first, rho, relative)
-        assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
+        assert np.allclose(at.T, whiten(columns, first, rho, relative), rtol=1e-12, atol=1e-12)
 
 
 def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):

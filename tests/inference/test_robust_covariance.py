@@ -210,6 +210,7 @@ def test_what_trials_share_stays_where_their_number_grows():
         assert fit_result.Number.from_json(one.to_json()).shared == one.shared
 
 
+@pytest.mark.slow
 def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
     """The sheet's value is part of the fitted one: the difference has its variance less that of the fit."""
     rng, z = np.random.default_rng(3), []

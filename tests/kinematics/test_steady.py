@@ -66,13 +66,12 @@ def test_the_end_of_growth_is_not_in_the_window(vine, end_frames):
         assert grown_m[inside(trial, window)].max() <= 0.95 * length_m + 1e-4
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 3e-5, 3e-4])
-@pytest.mark.parametrize("rho", [0.0, 0.6])
+@pytest.mark.parametrize(("noise_m", "rho"), [(0.0, 0.0), (3e-5, 0.0), (3e-5, 0.6), (3e-4, 0.0), (3e-4, 0.6)])
 def test_still_frames_oscillation_and_acceleration_are_never_steady_motion(noise_m, rho):
     time_s = np.arange(400) / 1069
     motions = [25 * np.maximum(time_s[:200] - time_s[rest], 0) ** 2 for rest in (0, 60)] + [0 * time_s]
     motions += [0.5 * time_s + 5e-4 * np.sin(150 * time_s)] * (noise_m < 3e-4)
-    for seed in range(1000, 1020):
+    for seed in range(1000, 1020 if noise_m else 1001):
         for y in motions:
             noise = ar1(y.size, noise_m, rho, np.random.default_rng(seed))
             assert not gated(plain_track(time_s[: y.size], y + noise)).accepted

@@ -45,7 +45,7 @@ from vinetrack.inference.sensitivity import (
 
 
 @njit(nogil=True, error_model="numpy")
-def products_at_releases(
+def white_at_releases(
     time_s: Floats,
     position_m: Floats,
     first: NDArray[np.bool_],
@@ -55,15 +55,14 @@ def products_at_releases(
     curves: Floats,
     rho: float,
 ) -> Floats:
-    """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to `whiten`
-    and a matrix product for each release. Curves are interpolated linearly, and constant beyond the ends of the grid.
-    The last column is the residual. Shapes: time_s, position_m, first, relative_sd (n_points,);
-    releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns, n_columns).
+    """Whitened columns and residual of a trial for each candidate release, as `whiten` makes them. Curves are
+    interpolated linearly, and constant beyond the ends of the grid. The last column is the residual. Shapes: time_s,
+    position_m, first, relative_sd (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) →
+    (n_releases, n_columns, n_points).
     """
     count, size, last = len(curves), len(time_s), len(grid_s) - 1
     begins = math.sqrt(1 - rho**2)
-    plain, white = np.empty((count, size)), np.empty((count, size))
-    products = np.empty((len(releases_s), count, count))
+    plain, white = np.empty((count, size)), np.empty((len(releases_s), count, size))
     for r in range(len(releases_s)):
         j = 0
         for i in range(size):
@@ -78,10 +77,9 @@ def products_at_releases(
             before = 0.0
             for i in range(size):
                 value = plain[c, i] / relative_sd[i]
-                white[c, i] = begins * value if first[i] else value - rho * before
+                white[r, c, i] = begins * value if first[i] else value - rho * before
                 before = value
-        products[r] = np.dot(white, white.T)
-    return products
+    return white
 
 
 # ------------------------------------------------------------------------------
@@ -314,10 +312,8 @@ def _best_release(
     relative = trial_data.point_sd
     position_m = trial_data.lead_position_m - trial_effects[ORIGIN]
     curves = np.vstack([sensitivities, plain])
-    square = (
-        products_at_releases(trial_data.time_s, position_m, trial_data.first, relative, releases, times, curves, rho)
-        / variance
-    )
+    white = white_at_releases(trial_data.time_s, position_m, trial_data.first, relative, releases, times, curves, rho)
+    square = white @ np.swapaxes(white, 1, 2) / variance
     effects = np.tile(trial_effects, (releases.size, 1))
     effects[:, RELEASE] = releases
     information = square[:, :-1, :-1] + np.diag(precision)
