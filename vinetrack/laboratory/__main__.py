@@ -21,7 +21,7 @@ from pathlib import Path
 import yaml
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.filming import film, make_filming, picture_target, recording_experiment
+from vinetrack.laboratory.filming import compile_the_tracker, film, make_filming, picture_target, recording_experiment
 from vinetrack.laboratory.tracks import grow, read_ground_truth, write_tracks
 
 DEMO = Path(__file__).with_name("demo.yaml")
@@ -50,20 +50,23 @@ def main(arguments: list[str] | None = None) -> None:
         except ValueError as error:
             parser.error(str(error))
         chosen = list(experiment.trials)
-    grown = grow(chosen, truth)
-    filmed = [trial for trial in grown if trial.stated.video is not None]
-    for trial in grown:
-        if trial.stated.track is not None:
-            write_tracks([trial], trial.stated.track.parent)
-    if filmed:
-        n_frames = sum(trial.track.time_s.size for trial in filmed)
-        told = f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest."
-        print(told, flush=True)
-        image = getattr(experiment.settings.calibration, "image", None)
-        if image is not None:
-            picture_target(filming, experiment.folder / image, truth.seed)
-        paths = [trial.stated.video for trial in filmed]
-        with ProcessPoolExecutor(given.processes) as pool:
+    with ProcessPoolExecutor(given.processes) as pool:
+        if any(trial.video for trial in chosen) and given.processes > 1:
+            pool.submit(compile_the_tracker)
+        grown = grow(chosen, truth)
+        for trial in grown:
+            if trial.stated.track is not None:
+                write_tracks([trial], trial.stated.track.parent)
+        if filmed := [trial for trial in grown if trial.stated.video is not None]:
+            n_frames = sum(trial.track.time_s.size for trial in filmed)
+            told = (
+                f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest."
+            )
+            print(told, flush=True)
+            image = getattr(experiment.settings.calibration, "image", None)
+            if image is not None:
+                picture_target(filming, experiment.folder / image, truth.seed)
+            paths = [trial.stated.video for trial in filmed]
             truths = pool.map(film, filmed, repeat(filming), paths, count(truth.seed))
             for i, (trial, seen) in enumerate(zip(filmed, truths, strict=True), 1):
                 print(f"filmed {i} of {len(filmed)}: {trial.stated.name}, {seen.time_s.size} frames", flush=True)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Trial
 from vinetrack.core.tables import replacing, write_bytes, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
@@ -25,6 +27,7 @@ from vinetrack.experiment.sheet import SHEET
 from vinetrack.laboratory.render import FrameRenderer, Motion, Truth, paint_board
 from vinetrack.laboratory.scene import PATTERN_PX, Camera, Scene, Target, Tube, preset
 from vinetrack.laboratory.tracks import VirtualTrial
+from vinetrack.video.track import track_recording
 
 Frame = NDArray[np.uint8 | np.uint16]
 
@@ -137,6 +140,14 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     moved = PchipInterpolator(time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m)
     how: dict[str, Any] = {"n_frames": n_frames, "capture_fps": capture_fps, "out_path": out_path, "seed": seed}
     return render_recording(scene, lambda at_s: moved(np.minimum(at_s, time_s[-1])), **how)
+
+
+def compile_the_tracker() -> None:
+    """Film and track a short growth, so that code is compiled while motions are computed: a quarter of a minute."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "growth.mp4"
+        render_recording(preset("demo"), lambda at_s: 4.0 * at_s, n_frames=60, capture_fps=1069.0, out_path=path)
+        track_recording(Trial(name="growth", video=path, capture_fps=1069.0, diameter_m=0.024, m_per_px=5e-4))
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
