@@ -1,18 +1,16 @@
 """Simulate the trials of an experiment folder and write the recordings or tracks that its sheet names.
 
     python -m vinetrack.laboratory data/demo [--nature FILE] [--processes N]
-    python -m vinetrack.laboratory data/paper --film FOLDER [--only PATTERN]
+    python -m vinetrack.laboratory data/paper --film FOLDER
 
 Trials with a `video` are filmed, with the calibration picture that `experiment.yaml` names; those with a `track` are
 measured. The sheet defines the trials, and `--nature` the ground truth (default: the file of this package with the name
-of the experiment's folder, else that of the demonstration). `--film` makes an experiment of recordings from one of
-tracks, with all its trials or those whose names match a pattern such as 'fig4_*'.
+of the experiment's folder, else that of the demonstration). `--film` makes recordings of an experiment of tracks.
 """
 
 from __future__ import annotations
 
 import argparse
-import fnmatch
 import os
 from concurrent.futures import ProcessPoolExecutor
 from itertools import count, repeat
@@ -33,7 +31,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("experiment", type=Path)
     parser.add_argument("--nature", type=Path)
     parser.add_argument("--film", type=Path, metavar="FOLDER")
-    parser.add_argument("--only", default="*", metavar="PATTERN")
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
@@ -41,19 +38,15 @@ def main(arguments: list[str] | None = None) -> None:
     path = given.nature or (named if named.exists() else DEMO)
     truth, content = read_ground_truth(path), yaml.safe_load(path.read_text(encoding="utf-8"))
     filming = make_filming(content.get("filming", {}))
-    chosen = [trial for trial in experiment.trials if fnmatch.fnmatch(trial.name, given.only)]
-    if not chosen:
-        parser.error(f"no trial of {given.experiment} matches {given.only!r}")
     if given.film is not None:
         try:
-            experiment = recording_experiment(experiment, [trial.name for trial in chosen], filming, given.film)
+            experiment = recording_experiment(experiment, filming, given.film)
         except ValueError as error:
             parser.error(str(error))
-        chosen = list(experiment.trials)
     with ProcessPoolExecutor(given.processes) as pool:
-        if any(trial.video for trial in chosen) and given.processes > 1:
+        if any(trial.video for trial in experiment.trials) and given.processes > 1:
             pool.submit(compile_the_tracker)
-        grown = grow(chosen, truth)
+        grown = grow(experiment.trials, truth)
         for trial in grown:
             if trial.stated.track is not None:
                 write_tracks([trial], trial.stated.track.parent)

@@ -7,7 +7,6 @@ target. Files are H.264 as in cameras, or FFV1 without loss.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -145,7 +144,7 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
 def compile_the_tracker() -> None:
     """Film and track a short growth, so that code is compiled while motions are computed: a quarter of a minute."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "growth.mp4"
+        path = Path(folder, "growth.mp4")
         render_recording(preset("demo"), lambda at_s: 4.0 * at_s, n_frames=60, capture_fps=1069.0, out_path=path)
         track_recording(Trial(name="growth", video=path, capture_fps=1069.0, diameter_m=0.024, m_per_px=5e-4))
 
@@ -158,8 +157,8 @@ def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
     write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
-def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
-    """Write sheet and settings of an experiment of recordings of these trials; nothing is filmed yet."""
+def recording_experiment(experiment: Experiment, filming: Filming, folder: Path) -> Experiment:
+    """Write sheet and settings of an experiment of recordings; nothing is filmed yet."""
     if experiment.settings.calibration is not None or any(trial.video for trial in experiment.trials):
         raise ValueError(f"{experiment.folder} is an experiment of recordings already")
     if folder.exists() and folder.samefile(experiment.folder):
@@ -176,12 +175,11 @@ def recording_experiment(experiment: Experiment, trials: Sequence[str], filming:
         "marker_mm": round(1e3 * target.marker_m, 6),
         "dictionary": target.dictionary,
     }
-    camera = yaml.safe_dump({"exposure_us": exposures_us.pop(), "calibration": board}, sort_keys=False)
+    settings = {"exposure_us": exposures_us.pop(), "calibration": board}
     sheet = pd.read_csv(experiment.folder / SHEET, dtype=str, keep_default_na=False)
-    sheet = sheet[sheet["trial"].isin(list(trials))].rename(columns={"track": "video"})
-    sheet["video"] = [f"videos/{trial}.mp4" for trial in sheet["trial"]]
+    sheet = sheet.rename(columns={"track": "video"}).assign(video=[f"videos/{trial}.mp4" for trial in sheet["trial"]])
     write_csv(folder / SHEET, sheet)
     path = experiment.folder / "experiment.yaml"
     shared = path.read_text(encoding="utf-8") if path.exists() else ""
-    write_text(folder / "experiment.yaml", shared + camera)
+    write_text(folder / "experiment.yaml", shared + yaml.safe_dump(settings, sort_keys=False))
     return read_experiment(folder, strict=True)

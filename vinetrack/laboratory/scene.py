@@ -273,13 +273,8 @@ def preset(name: str) -> Scene:
     faint = Tube(opacity=0.22, brightness=0.42, texture=0.08, specular=0.03, tip_glow=0.03)
     dark = Tube(opacity=0.75, brightness=0.10, texture=0.2, specular=0.08, tip_glow=0.02)
     bright_wall = Backdrop(brightness=0.42, gradient=0.55)
-    ball = Scene(
-        camera=Camera(width_px=384, height_px=800, m_per_px=1 / 3660),
-        subject=Ball(),
-        door=None,
-        growth_angle_deg=90.0,
-        backdrop=Backdrop(launcher=False),
-    )
+    upright, plain_wall = Camera(width_px=384, height_px=800, m_per_px=1 / 3660), Backdrop(launcher=False)
+    ball = Scene(camera=upright, subject=Ball(), door=None, growth_angle_deg=90.0, backdrop=plain_wall)
     dark_wall = Backdrop(brightness=0.07, gradient=-0.04, texture=0.3, launcher=False)
     scenes = {
         "clean": clean,
