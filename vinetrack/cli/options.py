@@ -25,7 +25,6 @@ import typer
 
 from vinetrack.core.problems import ExperimentError, InputError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
-from vinetrack.core.terminal import print_line
 from vinetrack.experiment.schema import COLUMNS, Column, option
 
 # ------------------------------------------------------------------------------
@@ -84,9 +83,16 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
         )
 
 
+def _print_line(line: str, err: bool = False) -> None:
+    """Print a line; on a terminal, `error` and `warning` at its beginning have their colours."""
+    word, colon, rest = line.partition(":")
+    colour = {"error": "red", "warning": "yellow"}.get(word)
+    typer.echo(f"{typer.style(word, fg=colour, bold=True)}:{rest}" if colour and colon else line, err=err)
+
+
 def _exit_with(message: str) -> None:
     for line in message.splitlines():
-        print_line(line, err=True)
+        _print_line(line, err=True)
     raise typer.Exit(1)
 
 
@@ -129,7 +135,7 @@ def command(
             log, json_file = values.pop("log", None), values.get("json")
             with errors_as_sentences(log):
                 with progress_line() as report:
-                    tools = {"say": partial(print_line, err=json_to_terminal(json_file)), "report": report}
+                    tools = {"say": partial(_print_line, err=json_to_terminal(json_file)), "report": report}
                     named = {name: value for name, value in {**values, **tools}.items() if name in wanted}
                     if "options" in wanted:
                         options = {name: value for name, value in values.items() if name not in {*wanted, "json"}}
@@ -138,7 +144,7 @@ def command(
                 if answer is not None:
                     lines, content, *failed = answer
                     for text in () if json_to_terminal(json_file) else lines:
-                        print_line(text)
+                        _print_line(text)
                     if json_file is not None and content is not None:
                         write_json(json_file, content)
                     if any(failed):

@@ -19,7 +19,7 @@ import posixpath
 import re
 import unicodedata
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import zip_longest
@@ -290,15 +290,23 @@ class JsonRecord:
 
 
 # ------------------------------------------------------------------------------
-# Reading YAML: repeated keys are errors, 10:20 is text, lines of keys are known.
+# Reading YAML: repeated keys are errors, 10:20 is text.
 
 
-@dataclass(frozen=True)
+@dataclass
 class YamlDocument:
-    """Content of a YAML file; `lines` maps the path of each key, as a tuple, to its line, from 1."""
+    """Content of a YAML file and its text."""
 
     content: Any
-    lines: dict[tuple[Any, ...], int]
+    text: str = ""
+
+    def line(self, path: Sequence[Any]) -> int:
+        """The line, from 1, of the last key of a path that begins a line; 0 if none does."""
+        lines, found = self.text.split("\n"), 0
+        for key in path:
+            pattern = re.compile(rf"""\s*["']?{re.escape(str(key))}["']?\s*:""")
+            found = next((n for n in range(found, len(lines)) if pattern.match(lines[n])), found - 1) + 1
+        return found
 
 
 def read_yaml(path: Path) -> YamlDocument:
@@ -314,42 +322,17 @@ def parse_yaml(text: str, file: str) -> YamlDocument:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    lines: dict[tuple[Any, ...], int] = {}
-    problems: list[Problem] = []
-    content: Any = {}
     try:
-        yaml = YAML(typ="safe", pure=True)
-        document = yaml.compose(text)
-        for path, line in _places(document):
-            if path in lines and path[-1] != "<<" and isinstance(path[-1], str):
-                remedy, key = f"keep one; the first is on line {lines[path]}", ".".join(map(str, path))
-                problems.append(Problem(message="is set twice", file=file, line=line, column=key, remedy=remedy))
-            lines[path] = line
-            if len(lines) > 10_000:  # largest document (chosen): nested aliases can expand beyond the memory
-                raise ValueError("too large")
-        if document is not None and not problems:
-            content = yaml.constructor.construct_document(document)
+        content = YAML(typ="safe", pure=True).load(text)
     except (YAMLError, RecursionError, ValueError, ArithmeticError, TypeError, LookupError, AttributeError) as error:
         reason = getattr(error, "problem", None) or "it cannot be understood"
         mark = getattr(error, "problem_mark", None)
+        place: dict[str, Any] = {"file": file, "line": mark.line + 1 if mark is not None else 0}
+        if twice := re.match('found duplicate key "(.*?)"', reason):
+            raise ExperimentError([Problem("", "is set twice", twice[1], remedy="keep one", **place)]) from None
         remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
-        line = mark.line + 1 if mark is not None else 0
-        problems = [Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)]
+        raise ExperimentError([Problem(message=f"is not YAML ({reason})", remedy=remedy, **place)]) from None
     if not isinstance(content, dict | None):
-        problems = [Problem(message="holds no settings", file=file, remedy="write lines such as 'key: value'")]
-    if problems:
-        raise ExperimentError(problems)
-    return YamlDocument(content or {}, lines)
-
-
-def _places(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], int]]:
-    """Yield the path of every key and element below a node, and its line."""
-    from ruamel.yaml.nodes import MappingNode, SequenceNode
-
-    if len(path) > 20:  # deepest document (chosen)
-        raise ValueError("too large")
-    for i, entry in enumerate(node.value if isinstance(node, MappingNode | SequenceNode) else ()):
-        first, inner = entry if isinstance(node, MappingNode) else (entry, entry)
-        name = i if first is inner else first.value if isinstance(first.value, str) else "?"
-        yield (*path, name), first.start_mark.line + 1
-        yield from _places(inner, (*path, name))
+        remedy = "write lines such as 'key: value'"
+        raise ExperimentError([Problem(message="holds no settings", file=file, remedy=remedy)])
+    return YamlDocument(content or {}, text)

@@ -20,17 +20,6 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
-def print_line(line: str, err: bool = False) -> None:
-    """Print a line; on a terminal that wants colours, `error` and `warning` at its beginning have theirs."""
-    from rich.console import Console
-    from rich.text import Text
-
-    text = Text(line)
-    text.highlight_regex("^error(?=:)", "bold red")
-    text.highlight_regex("^warning(?=:)", "bold yellow")
-    Console(stderr=err).print(text, soft_wrap=True)
-
-
 def table(
     rows: Iterable[Sequence[object]],
     header: Sequence[str] = (),
@@ -67,19 +56,15 @@ def waiting(description: str, total: int | None = None) -> Iterator[Progress]:
 
 def progress(items: Sequence[Item] | Iterator[Item], description: str, total: int | None = None) -> Iterator[Item]:
     """Yield items, and show how many are done; `total` is their number if they are no sequence."""
-    with waiting(description, len(items) if isinstance(items, Sequence) else total) as bar:
-        for item in items:
-            yield item
-            bar.advance(bar.task_ids[0])
+    with waiting(description) as bar:
+        yield from bar.track(items, total, task_id=bar.task_ids[0])
 
 
-def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:
-    """Return a table as HTML with all text escaped."""
-    above = f"<p><b>{html.escape(title)}</b></p>" if title else ""
-    names = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    table = f"<table><thead><tr>{names}</tr></thead><tbody>{body}</tbody></table>" if rows else ""
-    return above + table + "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+class Printed:
+    """What a notebook shows as it is printed."""
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def plot(shown: Any, name: str = "", **options: Any) -> Figure:

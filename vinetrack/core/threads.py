@@ -1,28 +1,10 @@
-"""Compiled functions, and the threads of a process that run them; no result depends on their number."""
+"""Compiled functions, and the threads of linear algebra; no result depends on their number."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any
-
-
-def available_cores() -> int:
-    """Number of cores that this process may use; all where that cannot be asked (macOS, Windows)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def thread_pool(threads: int) -> ThreadPoolExecutor:
-    """Thread pool of this process, for compiled code that releases Python's lock; a forked process gets its own."""
-    return _pool(os.getpid(), threads)
-
-
-@lru_cache
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    return ThreadPoolExecutor(threads)
 
 
 def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:

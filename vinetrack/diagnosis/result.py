@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
-from vinetrack.core.problems import Remark, in_words, remark
+from vinetrack.core.problems import Remark, in_words
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import plot
+from vinetrack.core.terminal import Printed, plot
 from vinetrack.diagnosis.power import Power, StoredRemark
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
@@ -177,7 +177,7 @@ def _told(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(JsonRecord):
+class Diagnosis(Printed, JsonRecord):
     """The result of a diagnosis. Printed, it is the text on the terminal. `effects` are those added, in order; `fits`
     the initial model and every enlarged one.
     """
@@ -286,9 +286,6 @@ class Diagnosis(JsonRecord):
     def __repr__(self) -> str:
         named = ", ".join(self.effects or self.answer_set)
         return f"Diagnosis({self.verdict or 'refused'}{f': {named}' if named else ''})"
-
-    def _repr_html_(self) -> str:
-        return str(remark("diagnosis_page", diagnosis=self))
 
     def __str__(self) -> str:
         return in_words(self)

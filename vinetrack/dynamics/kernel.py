@@ -18,19 +18,20 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core import units
 from vinetrack.core.records import Floats
 from vinetrack.core.tables import write_text
-from vinetrack.core.threads import available_cores, thread_pool
 from vinetrack.dynamics.equations import BatchArrays
 from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
 from vinetrack.effects import Effect, State, TrialInputs
@@ -193,8 +194,6 @@ _LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash
 @lru_cache(maxsize=64)
 def kernel(effects: tuple[Effect, ...]) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`."""
-    import numba
-
     source = sum_source(effects)
     integrator = (Path(__file__).with_name(name) for name in ("equations.py", "integrator.py"))
     parts = [source, *(file.read_text(encoding="utf-8") for file in integrator)]
@@ -249,19 +248,19 @@ class Batch:
         count = self.starts.size - 1
         out, ends = np.empty((self.stamps.size, 4)), np.empty((count, 5))
         # For fewer than 64 trials another thread costs more than it saves.
-        threads = max(1, min(available_cores(), count // 64))
+        threads = min(numba.config.NUMBA_NUM_THREADS, count // 64)
         longest = int(np.diff(self.starts).max(initial=0))
 
         def integrate(first: int, last: int) -> None:
             work, means = np.empty((7, 4)), np.empty(longest)
             self.integrate_many(self.arrays, first, last, relative_tolerance, out, ends, work, means)
 
-        edges = np.linspace(0, count, threads + 1).astype(int).tolist()
-        own, *others = itertools.pairwise(edges)
-        shares = [thread_pool(threads).submit(integrate, *part) for part in others]
-        integrate(*own)
-        for share in shares:
-            share.result()
+        if threads < 2:
+            integrate(0, count)
+        else:
+            edges = np.linspace(0, count, threads + 1).astype(int)
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(integrate, edges[:-1], edges[1:]))
         return out, ends
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.terminal import html_table
+from vinetrack.core.terminal import Printed
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, TrialInputs, catalogue, find_effect, load_effect
 from vinetrack.experiment.schema import COLUMNS
@@ -35,7 +35,7 @@ def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]
 
 
 @dataclass(frozen=True, repr=False)
-class Model:
+class Model(Printed):
     """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
 
     `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; parameters
@@ -163,10 +163,6 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({' + '.join(self.names)})"
-
-    def _repr_html_(self) -> str:
-        rows = [(effect.name, effect.formula, effect.summary) for effect in self.effects]
-        return html_table(("effect", "in the equation of motion", ""), rows)
 
     def __str__(self) -> str:
         terms = "\n         ".join(effect.formula for effect in self.effects)

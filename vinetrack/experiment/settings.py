@@ -331,7 +331,7 @@ def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
     """Validate settings of a run given as a mapping, such as Snakemake's `config`."""
-    return RunSettings.read_from(YamlDocument(values, {}), "config.yaml")
+    return RunSettings.read_from(YamlDocument(values), "config.yaml")
 
 
 def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detail: Any) -> Problem:
@@ -339,9 +339,8 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     found = detail["loc"]
     # pydantic inserts the kind of a calibration between "calibration" and the key; the file does not contain it.
     location = (found[0], *found[2:]) if found[0] == "calibration" else found
-    starts = (location[:n] for n in range(len(location), 0, -1))
-    line = next((document.lines[start] for start in starts if start in document.lines), 0)
-    place: dict[str, Any] = {"file": file, "line": line, "column": ".".join(str(part) for part in location)}
+    column = ".".join(str(part) for part in location)
+    place: dict[str, Any] = {"file": file, "line": document.line(location), "column": column}
     if detail["type"] == "extra_forbidden":
         group: Any = model
         if len(found) > 1:
@@ -404,9 +403,10 @@ def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) ->
             if other not in keys or None not in (keys.get(name), keys[other]):
                 continue
             if (value := keys.pop(other)) is not None:
-                line = document.lines[*path, name] = document.lines.get((*path, other), 0)
+                place = {"column": ".".join((*path, other)), "file": file, "line": document.line((*path, other))}
+                document.text = document.text.replace(f"{other}:", f"{name}:")
                 keys[name] = _converted(value, unit, name)
-                problems.append(_conversion(name, unit, column=".".join((*path, other)), file=file, line=line))
+                problems.append(_conversion(name, unit, **place))
 
 
 def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:

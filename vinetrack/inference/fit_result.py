@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import html_table, plot, table
+from vinetrack.core.terminal import Printed, plot, table
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
@@ -424,7 +424,7 @@ class TrialFit(TrialEstimates):
         return float(np.sqrt(np.mean(self.residual_m**2)))
 
 
-class NumberTable:
+class NumberTable(Printed):
     """Access to the numbers of a fit and their covariance, common to a fit in memory and one read from a file."""
 
     names: tuple[str, ...]
@@ -437,11 +437,6 @@ class NumberTable:
     def heading(self) -> str:
         """The model and the number of trials, in words."""
         return f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
-
-    def _repr_html_(self) -> str:
-        head = ("", "value", "standard error", "of it shared", "95 % interval", "unit")
-        rows = [number_row(number) for number in self.numbers]
-        return html_table(head, rows, self.heading, list(map(str, self.messages)))
 
     def __getitem__(self, name: str) -> Number:
         """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique."""

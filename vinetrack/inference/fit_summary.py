@@ -17,7 +17,6 @@ from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.inference.errors import robust_variances, trial_information, with_systematics
 from vinetrack.inference.fit_result import (
@@ -132,11 +131,6 @@ class FitSummary(NumberTable, JsonRecord):
     def __repr__(self) -> str:
         state = "refused" if self.refused else f"{len(self.trials)} trials"
         return f"FitSummary({' + '.join(self.names)}; {state})"
-
-    def _repr_html_(self) -> str:
-        if self.refused:
-            return html_table((), (), f"{' + '.join(self.names)} was not fitted: {self.refused}")
-        return super()._repr_html_()
 
     def __str__(self) -> str:
         if self.refused:

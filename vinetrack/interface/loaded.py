@@ -19,7 +19,7 @@ import pandas as pd
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Kinematics, Track, Trial, plain_track
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import html_table, plot
+from vinetrack.core.terminal import Printed, plot
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.power import Power
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from vinetrack.results.diagnosis_tables import DiagnosisTables
 
 
-class LoadedResults:
+class LoadedResults(Printed):
     """A results folder, whose files are read on first access. Tables are pandas DataFrames whose columns carry their
     units, as in the files (`docs/results.md`).
     """
@@ -159,11 +159,9 @@ class LoadedResults:
         verdict = "not diagnosed" if diagnosis is None or not diagnosis.verdict else diagnosis.verdict
         return f"{usable} of {len(self.trials)} trials; {verdict}{f': {named}' if named else ''}"
 
-    def _repr_html_(self) -> str:
-        title = f"{self.name}: {self._state()}"
-        if self.diagnosis is not None and self.diagnosis.verdict:
-            return html_table((), (), title) + self.diagnosis._repr_html_()
-        return html_table((), (), title) + self.fit._repr_html_()
+    def __str__(self) -> str:
+        is_diagnosed = self.diagnosis is not None and self.diagnosis.verdict
+        return f"{self.name}: {self._state()}\n\n{self.diagnosis if is_diagnosed else self.fit}"
 
 
 def load(folder: Path | str) -> LoadedResults:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core import units
 from vinetrack.core.problems import joined
-from vinetrack.core.terminal import html_table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
 from vinetrack.diagnosis.result import (
     EXPECTED,
@@ -29,7 +28,6 @@ from vinetrack.narrative.verdict_text import (
     odd_in_words,
     spaced_name,
     verdict_line,
-    verdict_sentence,
     verdict_table,
 )
 
@@ -362,13 +360,6 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     return lines + [f"! {message}" for message in after.messages]
 
 
-def diagnosis_page(diagnosis: Diagnosis) -> str:
-    """Return the first screen of a diagnosis as HTML, for a notebook."""
-    rows = [(row.question, row.answer, row.note) for row in verdict_table(diagnosis)[1:]]
-    title = f"{diagnosis.verdict or 'refused'}: {verdict_sentence(diagnosis)}"
-    return html_table(("", "", ""), rows, title, [diagnosis.explanation])
-
-
 # ------------------------------------------------------------------------------
 # Simple laws of a missing force.
 
@@ -608,7 +599,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         f" measurement. {measurement}"
     ),
     "trials_to_make": advice_text,
-    "diagnosis_page": diagnosis_page,
     "law": law_text,
     "fails_most": fails_most_text,
     "drifts": drift_text,
