@@ -9,7 +9,7 @@ from hand_sheet import GOOD, HEADER, TRACK, one, two_vines, write
 
 from vinetrack.core.problems import ExperimentError, InputError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
-from vinetrack.core.units import convert, other_units, split_unit
+from vinetrack.core.units import convert, other_units, pressure_text, split_unit
 from vinetrack.experiment import folder
 from vinetrack.experiment.folder import planned_sheet, planned_trial
 from vinetrack.experiment.schema import COLUMNS, with_names
@@ -204,7 +204,8 @@ def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
     assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "warning")}
     assert said.keys() == {"diameter_in", "pressure_psi", "payload_oz", "yield_pressure_psi"}
     assert "6.89476" in said["pressure_psi"].message
-    assert (trial.pressure_in_words(), trial.condition.split("_")[1]) == ("4 psi (27.6 kPa)", "4psi")
+    pressure = pressure_text(trial.pressure_Pa, trial.pressure_unit)
+    assert (pressure, trial.condition.split("_")[1]) == ("4 psi (27.6 kPa)", "4psi")
     assert (said["yield_pressure_psi"].file, said["yield_pressure_psi"].line) == ("experiment.yaml", 1)
 
 

@@ -1,4 +1,4 @@
-"""Records passed between stages: trial, track, kinematics, steady window.
+"""Records passed between stages: trial, track, kinematics.
 
 Plain data in SI units, without file access. `lead_` is the leading edge (what a camera sees), `tail_` the tail and a
 payload riding on it; the tail moves `travel_ratio` times as fast as the leading edge.
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3, pressure_text
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -120,10 +120,6 @@ class Trial:
             return f"{self.vine}, {self.specimen}" if shared == "specimen" and self.specimen else self.vine
         return f"{shared} {value}" if (value := getattr(self, shared, "")) else ""
 
-    def pressure_in_words(self, digits: int = 3) -> str:
-        """Return the pressure as the sheet states it, with its unit."""
-        return pressure_text(self.pressure_Pa, self.pressure_unit, digits)
-
     @property
     def area_m2(self) -> float:
         """Cross-section A = πD²/4."""
@@ -219,21 +215,3 @@ class Kinematics:
     def tail_velocity_m_s(self) -> Floats:
         """Speed of the tail: `travel_ratio` times that of the leading edge, shape (n,)."""
         return self.travel_ratio * self.lead_velocity_m_s
-
-
-@dataclass(frozen=True)
-class Window:
-    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady."""
-
-    rule: str
-    accepted: bool
-    reason: str
-    from_s: float = math.nan
-    to_s: float = math.nan
-    n_points: int = 0
-    x_ss_m_s: float = math.nan
-    x_ss_sigma_m_s: float = math.nan
-    drift: float = math.nan
-    drift_95: tuple[float, float] = (math.nan, math.nan)
-    cv: float = math.nan
-    doubtful: bool = False

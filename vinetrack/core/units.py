@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,9 +50,8 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def with_error(value: float | None, sigma: float | None) -> str:
     """Return `value ± sigma`, the error to two significant digits and the value to the same decimal."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+    value, sigma = or_nan(value), or_nan(sigma)
+    if not (math.isfinite(value) and 0 < sigma < math.inf):
         return number(value)
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 rounds to 0.010
     # 6: decimals beyond which value and error are written with a common power of ten (chosen)
@@ -105,31 +104,21 @@ class Unit:
         return value * self.divide / self.multiply
 
 
-def _units(scales: dict[str, str]) -> Iterator[tuple[str, Unit]]:
-    """Yield the units of a table that states, by SI unit, `name=multiply/divide` of each."""
-    texts = {"um": "µm", "m": "metres", "us": "µs", "cm3": "cm³", "l": "litres", "m3": "m³", "deg": "degrees"}
-    texts |= {"rad": "radians", "g_cm3": "g/cm³", "kg_m3": "kg/m³", "fps": "frames per second"}
-    for si, units in scales.items():
-        for name, _, scale in (unit.partition("=") for unit in units.split()):
-            multiply, _, divide = scale.partition("/")
-            yield name, Unit(si, texts.get(name, name), float(multiply), float(divide or 1))
-
-
-# Units by the suffix of a name
-UNITS = dict(
-    _units(
-        {
-            "Pa": "Pa=1 mbar=100 kPa=1000 psi=6894.757293168361 bar=1e5 MPa=1e6",
-            "m": "nm=1/1e9 um=1/1e6 mm=1/1000 cm=1/100 in=25.4/1000 ft=304.8/1000 m=1",
-            "kg": "mg=1/1e6 g=1/1000 oz=28.349523125/1000 lb=453.59237/1000 kg=1",
-            "s": "ns=1/1e9 us=1/1e6 ms=1/1000 s=1",
-            "m3": "ml=1/1e6 cm3=1/1e6 l=1/1000 m3=1",
-            "rad": f"deg={math.pi / 180!r} rad=1",
-            "kg_m3": "g_cm3=1000 kg_m3=1",
-            "fps": "fps=1",
-        }
-    )
-)
+# Units by the suffix of a name: by SI unit, name=multiply/divide, then what is printed in place of the name
+UNITS = {
+    name: Unit(si, text[0].replace("_", " ") if text else name, *map(float, scale.split("/")))
+    for si, units in {
+        "Pa": "Pa=1 mbar=100 kPa=1000 psi=6894.757293168361 bar=1e5 MPa=1e6",
+        "m": "nm=1/1e9 um=1/1e6=µm mm=1/1000 cm=1/100 in=25.4/1000 ft=304.8/1000 m=1=metres",
+        "kg": "mg=1/1e6 g=1/1000 oz=28.349523125/1000 lb=453.59237/1000 kg=1",
+        "s": "ns=1/1e9 us=1/1e6=µs ms=1/1000 s=1",
+        "m3": "ml=1/1e6 cm3=1/1e6=cm³ l=1/1000=litres m3=1=m³",
+        "rad": f"deg={math.pi / 180!r}=degrees rad=1=radians",
+        "kg_m3": "g_cm3=1000=g/cm³ kg_m3=1=kg/m³",
+        "fps": "fps=1=frames_per_second",
+    }.items()
+    for name, scale, *text in (unit.split("=") for unit in units.split())
+}
 
 # Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
 DISPLAY_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "kg": ("g", 1e3), "1": ("", 1.0)}
@@ -165,10 +154,8 @@ def other_units(name: str) -> dict[str, str]:
 
 def convert(value: float, unit: str, to: str) -> float:
     """Convert a value to another unit of the same quantity."""
-    given, wanted = UNITS[unit], UNITS[to]
-    if given.si != wanted.si:
-        raise ValueError(f"{given.text} cannot be turned into {wanted.text}")
     # One product of both factors avoids the rounding of an intermediate SI value: 1 in is exactly 25.4 mm.
+    given, wanted = UNITS[unit], UNITS[to]
     return value * (given.multiply * wanted.divide) / (given.divide * wanted.multiply)
 
 

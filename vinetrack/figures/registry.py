@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from vinetrack.core.units import pressure_text
 from vinetrack.figures.style import look
 from vinetrack.results.diagnosis_tables import DiagnosisTables, read_diagnosis_tables
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_json, read_result
@@ -188,4 +189,4 @@ def features(trial: Trial) -> list[str]:
     sizes += f" × {1e6 * trial.thickness_m:.4g} µm" if np.isfinite(trial.thickness_m) else ""
     sizes += f" × {1e3 * trial.length_m:.4g} mm" if np.isfinite(trial.length_m) else ""
     payload = [f"{1e3 * trial.payload_kg:.3g} g"] if trial.payload_kg else []
-    return [sizes, trial.pressure_in_words(), *payload]
+    return [sizes, pressure_text(trial.pressure_Pa, trial.pressure_unit), *payload]

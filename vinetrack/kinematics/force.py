@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
+from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
@@ -38,6 +38,26 @@ class Release:
     lead_position_sigma_m: float
     moving_from_start: bool
     reason: str
+
+
+@dataclass(frozen=True)
+class Window:
+    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady.
+    Speeds are those of the tail.
+    """
+
+    rule: str
+    accepted: bool
+    reason: str
+    from_s: float = math.nan
+    to_s: float = math.nan
+    n_points: int = 0
+    x_ss_m_s: float = math.nan
+    x_ss_sigma_m_s: float = math.nan
+    drift: float = math.nan
+    drift_95: tuple[float, float] = (math.nan, math.nan)
+    cv: float = math.nan
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)

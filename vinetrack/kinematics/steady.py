@@ -1,6 +1,6 @@
 """Steady windows of a trial, by an equivalence test (gated rule), by the paper's rule, or chosen by hand.
 
-Speeds in a `Window` are **tail** speeds. The gated rule finds the longest stretch, well above rest, whose change of
+The gated rule finds the longest stretch, well above rest, whose change of
 speed is shown to be small (an equivalence test), rather than merely not shown to be large.
 
 The paper's rule is a coefficient of variation below 3 % over at least three points: Alvarez et al., "High-Velocity,
@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Window, with_flag
+from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.experiment.settings import SteadySettings
-from vinetrack.kinematics.force import TrialMotion
+from vinetrack.kinematics.force import TrialMotion, Window
 from vinetrack.kinematics.velocity import correlated
 
 # ------------------------------------------------------------------------------

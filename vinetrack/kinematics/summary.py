@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
+from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
@@ -24,6 +24,7 @@ from vinetrack.kinematics.force import (
     Release,
     SteadyForce,
     TrialMotion,
+    Window,
     find_release,
     flag_rest,
     known_pressure,

@@ -512,11 +512,12 @@ def trial_text(trial: Trial) -> str:
     direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
     rig = "" if math.isnan(trial.chamber_m3) else f", chamber {volume_text(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
-    return f"{size} at {trial.pressure_in_words(4)}, {payload}, growing {direction}{rig}"
+    return f"{size} at {pressure_text(trial.pressure_Pa, trial.pressure_unit, 4)}, {payload}, growing {direction}{rig}"
 
 
 def _size_text(trial: Trial) -> str:
-    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_in_words(4)}"
+    pressure = pressure_text(trial.pressure_Pa, trial.pressure_unit, 4)
+    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {pressure}"
 
 
 def value_in_unit(value: float, unit: str) -> str:
