@@ -8,14 +8,7 @@ from __future__ import annotations
 
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
-from vinetrack.effects._catalogue import (
-    EffectError,
-    catalogue,
-    find_effect,
-    load_effect,
-    own_effects,
-    remember,
-)
+from vinetrack.effects._catalogue import EffectError, catalogue, find_effect, load_effect, own_effects, remember
 
 __all__ = [
     "BASE_EFFECTS",

@@ -114,9 +114,6 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
     """The effect that a file defines: its names in capitals are fields of `Effect`, of which pydantic checks types."""
     # From the source, because from Python 3.13 on `__doc__` loses the indentation that marks the formula.
     text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
-    breakpoints = of_rig = getattr(module, "breakpoints", None)
-    if of_rig is not None and len(inspect.signature(of_rig).parameters) == 1:
-        breakpoints = lambda rig, *_: of_rig(rig)  # noqa: E731
     capitals = {field.name.upper(): field.name for field in fields(Effect)}
     given = {capitals[name]: value for name, value in vars(module).items() if name in capitals}
     given |= {
@@ -125,7 +122,7 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
         "text": text,
         "functions": {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))},
         "path": path.resolve(),
-        "breakpoints": breakpoints,
+        "breakpoints": getattr(module, "breakpoints", None),
     }
     return _adapter().validate_python(given)
 

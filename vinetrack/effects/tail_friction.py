@@ -42,7 +42,7 @@ def tail_force(s, rig, mu_w):
     return -mu_w * np.minimum(s.lead_position, rig.length - s.lead_position)
 
 
-def breakpoints(rig):
+def breakpoints(rig, mu_w):
     return () if rig.tail_on_reel > 0.0 else (rig.length / 2,)
 
 
