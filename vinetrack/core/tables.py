@@ -97,15 +97,8 @@ class Table:
 
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
         """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error. Shape (n_rows,)."""
-        cells = [row[column] for row in self.rows]
-        # Fast path, 10 times faster: a column of plain numbers needs no check of each cell.
-        if self.decimal == "." and not re.search(r"[^0-9eE+.\n-]", "\n".join(cells)):
-            with contextlib.suppress(ValueError):
-                plain = np.array(cells, dtype=float)
-                if np.isfinite(plain).all():
-                    return plain
-        values = np.full(len(cells), np.nan)
-        for i, cell in enumerate(cells):
+        values = np.full(len(self.rows), np.nan)
+        for i, cell in enumerate(row[column] for row in self.rows):
             if cell or not blank_is_nan:
                 try:
                     values[i] = parse_number(cell, self.decimal)
@@ -216,16 +209,12 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
 def safe_join(folder: Path, relative: str) -> Path:
     """Path of a file inside `folder`, backslashes as slashes; its text is checked: a link may lead outside."""
     text = relative.strip().replace("\\", "/")
-    # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
-    if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
-        raise InputError("contains characters that no path should have", "type it again")
-    if text.startswith("/") or re.match(r"[A-Za-z]:", text):
-        raise InputError("is an absolute path", "write it relative to the experiment folder")
     inside = posixpath.normpath(text)
-    if inside.split("/")[0] == "..":
-        raise InputError("leads out of the experiment folder", "move the file into it, or put a link there")
-    if inside == ".":
-        raise InputError("names no file", "write a path relative to the experiment folder")
+    # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
+    is_forged = any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text)
+    if is_forged or re.match(r"/|[A-Za-z]:", text) or inside.split("/")[0] in ("..", "."):
+        remedy = "write it relative to the folder; a file outside is reached by a link in it"
+        raise InputError("is no path inside the experiment folder", remedy)
     return folder / inside
 
 
@@ -255,8 +244,7 @@ def write_text(path: Path, text: str) -> None:
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
     """Write a table atomically as CSV: all digits, `NaN` for missing numbers, blank for missing text."""
     text_columns = frame.columns[[dtype.kind not in "fiub" for dtype in frame.dtypes]]
-    filled = frame.astype(dict.fromkeys(text_columns, object))
-    filled[text_columns] = filled[text_columns].where(filled[text_columns].notna(), "")
+    filled = frame.astype(dict.fromkeys(text_columns, object)).fillna(dict.fromkeys(text_columns, ""))
     write_text(path, filled.to_csv(index=False, na_rep="NaN", lineterminator="\n"))
 
 
