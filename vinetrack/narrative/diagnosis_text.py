@@ -10,13 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core import units
 from vinetrack.core.problems import joined
+from vinetrack.core.terminal import table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
-from vinetrack.diagnosis.result import (
-    EXPECTED,
-    NOT_TESTABLE,
-    Diagnosis,
-    Round,
-)
+from vinetrack.diagnosis.result import EXPECTED, NOT_TESTABLE, Diagnosis, Round
 from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative import sentence
@@ -26,6 +22,7 @@ from vinetrack.narrative.verdict_text import (
     expected_text,
     odd_deciding_in_words,
     odd_in_words,
+    percent,
     spaced_name,
     verdict_line,
     verdict_table,
@@ -47,13 +44,6 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # The power of a campaign in sentences: detectable sizes of effects, undetectable effects, false-alarm rate.
 
-LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
-
-
-def percent(rate: float) -> str:
-    """Return a rate in per cent, two digits."""
-    return f"{number(100 * rate, 2)} %"
-
 
 def size_text(power: EffectPower, value: float) -> str:
     """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none."""
@@ -63,33 +53,9 @@ def size_text(power: EffectPower, value: float) -> str:
     return f"{number(factor * value, 2)} {unit}".strip()
 
 
-def _at_largest(power: EffectPower) -> float:
-    """Probability with which an effect of the largest plausible size is detected."""
-    return power.probability_at(power.largest)
-
-
 def false_alarm_sentence(power: Power) -> str:
     """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
     return sentence("false_alarms", {"rate": power.false_alarm_rate})
-
-
-def detectable_count(power: Power) -> str:
-    """Return how many effects the trials detect with 90 % power at their largest plausible size."""
-    n_detectable = sum(_at_largest(entry) >= 0.9 for entry in power.effects)
-    return f"{n_detectable} of {len(power.effects) + len(power.not_testable)} effects"
-
-
-def unseen(power: Power) -> list[str]:
-    """Return the physical effects that are not testable, or detected with less than 10 % power at any
-    plausible size.
-    """
-    undetectable = [entry.effect for entry in _physical(power) if _at_largest(entry) < LOW_POWER]
-    return [*undetectable, *(name for name in power.not_testable if name not in undetectable)]
-
-
-def _physical(power: Power) -> list[EffectPower]:
-    """The physical effects; all effects where none is physical."""
-    return [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
 
 
 def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
@@ -104,7 +70,7 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
                 size_text(entry, entry.size_at(0.5)),
                 size_text(entry, entry.size_at(0.9)),
                 size_text(entry, entry.largest),
-                percent(_at_largest(entry)),
+                percent(entry.probability_at(entry.largest)),
                 taken or "–",
             )
         )
@@ -117,8 +83,6 @@ POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", 
 
 def power_lines(power: Power) -> list[str]:
     """Return what `vinetrack power` prints: all effects in a table, visible ones first."""
-    from vinetrack.core.terminal import table
-
     listed = power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))
     lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
@@ -155,8 +119,6 @@ def simulated_lines(power: Power) -> list[str]:
 
 def further_lines(plan: FurtherTrials) -> list[str]:
     """Return the further trials with which an effect is detected with the wanted power, a row for each condition."""
-    from vinetrack.core.terminal import table
-
     power = plan.power
     what = f"{spaced_name(power.effect)} at {power.symbol} = {size_text(power, plan.value)}"
     if plan.before >= plan.target:
@@ -249,16 +211,11 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
     fit = damping.get(PREFERRED) or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
         return f"No damping law: {(fit.get('refused') or 'no trial gave a steady speed').removesuffix('.')}."
-    vines = fit["vines"]
-    n_trials = sum(law["n_trials"] for law in vines.values())
-    n = with_interval(fit["n"], fit.get("n_95"))
-    if len(vines) == 1:
-        (law,) = vines.values()
-        B = with_interval(law["B"], law.get("B_95"))
-        law = f"damping exponent n = {n}, with B = {B} N·(s/m)ⁿ, from {_count(n_trials, 'trial')} of one vine"
-    else:
-        law = f"one damping exponent fits all vines: n = {n}, from {_count(n_trials, 'trial')} of {len(vines)} vines"
-    return f"From steady speeds: {law}."
+    first, *others = fit["vines"].values()
+    n, count = with_interval(fit["n"], fit.get("n_95")), sum(law["n_trials"] for law in (first, *others))
+    B = with_interval(first["B"], first.get("B_95"))
+    facts = {"n": n, "B": B, "count": count, "vines": len(fit["vines"])}
+    return sentence("damping_law" if others else "damping_law_of_one", facts)
 
 
 def status_tally(trials: pd.DataFrame) -> str:
@@ -301,8 +258,6 @@ def table_lines(diagnosis: Diagnosis, notes: bool = True) -> list[str]:
 
 
 def _ranking(step: Round) -> list[str]:
-    from vinetrack.core.terminal import table
-
     testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
     rows = [
         (
@@ -320,8 +275,6 @@ def _ranking(step: Round) -> list[str]:
 
 
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:
-    from vinetrack.core.terminal import table
-
     body = []
     for row in ladder.to_dict("records"):
         model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") else "")
@@ -332,10 +285,8 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     return list(table(body, headings, align="<>>>><"))
 
 
-def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
+def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
     """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables."""
-    from vinetrack.core.terminal import table as aligned
-
     # The model with the effect contains the one without it: a loss shows that the optimiser has not converged.
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     # 9.0: Δχ² above which an added effect is said to help (derived)
@@ -345,7 +296,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {helps}",
         "",
         "position error",
-        *_ladder_table(table),
+        *_ladder_table(ladder),
         "",
         "parameters",
     ]
@@ -356,7 +307,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         place = changed.setdefault((title, unit), {})
         place["after" if row["added"] else "before"] = with_error(row["value"] * factor, row["sigma"] * factor)
     body = [(title, of.get("before", "–"), of.get("after", "–"), unit) for (title, unit), of in changed.items()]
-    lines += aligned(body, ("", "before", "after", "unit"), align="<>><")
+    lines += table(body, ("", "before", "after", "unit"), align="<>><")
     return lines + [f"! {message}" for message in after.messages]
 
 
@@ -464,9 +415,9 @@ def proposal_lines(proposal: Proposal) -> list[str]:
         lines += [f"These data fit nearly as well with {joined(others)}."] if others else []
     else:
         lines.append(f"{proposal.reason}{'' if proposal.table else '; nothing is proposed'}.")
-    if (table := proposal.table) is not None:
-        before, after = proposal.before.chi2_per_dof, table.ratio.fit.chi2_per_dof
-        facts = {"name": table.effect.name, "before": before, "after": after, "rms_m": table.rms_left_out_m}
+    if (learned := proposal.table) is not None:
+        before, after = proposal.before.chi2_per_dof, learned.ratio.fit.chi2_per_dof
+        facts = {"name": learned.effect.name, "before": before, "after": after, "rms_m": learned.rms_left_out_m}
         lines.append(sentence("no_formula_but_a_table", facts))
     return lines
 
@@ -536,13 +487,10 @@ def _sizes(changes: Sequence[tuple[str, float, str]], by: str) -> list[str]:
     return [f"{name} {by} {size}".rstrip() for name, size in sized]
 
 
-def _of_draws(share: float) -> str:
-    return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
-
-
 # Facts in words, by the names that `sentences.csv` gives them in place of a format
 FORMS: dict[str, Callable[[Any], str]] = {
     "and": joined,
+    "is": lambda names: "is" if len(names) == 1 else "are",
     "list": ", ".join,
     "rivals": "; ".join,
     "sum": " + ".join,
@@ -557,7 +505,8 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "condition": lambda condition: _condition_text(**condition),
     "variables": _variables_text,
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
-    "draws": _of_draws,
+    "draws": lambda share: "in every draw" if share > 0.995 else f"in {share:.0%} of the draws",
+    "spaced": lambda name: name.replace("_", " "),
     "percent": percent,
     "trials": trials_in_words,
     "separated": lambda if_true: ", ".join(
@@ -570,14 +519,6 @@ FORMS: dict[str, Callable[[Any], str]] = {
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
-    "no_tube": lambda column: (
-        f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
-        " body that moves as a whole has none"
-    ),
-    "left_out_error_without": lambda left_out, count, reason: (
-        f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
-        f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
-    ),
     "sweeps": lambda trial, swept_m3, in_full: (
         f"{trial_text(trial) if in_full else _size_text(trial)}: it sweeps {volume_text(swept_m3)}"
     ),
@@ -585,20 +526,9 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
     ),
-    "tail_compressed": lambda share, median_N, low_N, has_payload: (
-        f"the model predicts compression in the tail {_of_draws(share)} (least tension {median_N:.2g} N"
-        f"{'' if median_N < 0 else f', below {low_N:.2g} N in one draw of twenty'}), which thin film cannot carry: the"
-        " payload runs ahead of the film"
-        f"{', and the ejection speed of the payload is at least the one stated' if has_payload else ''};"
-        " `--tail-slack free` allows that"
-    ),
     "odd_trials": odd_in_words,
     "odd_trials_decide": odd_deciding_in_words,
     "deciding_measurements": measurement_text,
-    "measure_first": lambda faults, measurement: (
-        f"Measure before making more trials: {joined(faults)} {'are errors' if len(faults) > 1 else 'is an error'} of"
-        f" measurement. {measurement}"
-    ),
     "trials_to_make": advice_text,
     "law": law_text,
     "fails_most": fails_most_text,

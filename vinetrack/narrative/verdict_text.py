@@ -90,6 +90,11 @@ class Row:
     note: str = ""
 
 
+def percent(rate: float) -> str:
+    """Return a rate in per cent, two digits."""
+    return f"{number(100 * rate, 2)} %"
+
+
 def spaced_name(effect: str) -> str:
     """Return the name of an effect with blanks for underscores."""
     return str(effect).replace("_", " ")
@@ -166,8 +171,6 @@ def _thereafter(diagnosis: Diagnosis) -> str:
 
 
 def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
-    from vinetrack.narrative.diagnosis_text import percent
-
     tested = [row for row in diagnosis.ranking if row.status != NOT_TESTABLE and is_finite(row.sigma)]
     inside = [row for row in tested if row.in_answer_set]
     answer = ""
@@ -259,19 +262,22 @@ def _why_not(row: Candidate, best: float) -> str:
 
 
 def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
-    from vinetrack.narrative.diagnosis_text import detectable_count, unseen
-
+    """Effects that would not have been detected, of any plausible size or of smaller ones."""
     power = diagnosis.power
     if power is None:
         return "", ""
     if power.wary or not power.effects:
         return "sizes that trials would detect were not computed", str(power.wary)
-    undetectable = unseen(power)
+    at_largest = {entry.effect: entry.probability_at(entry.largest) for entry in power.effects}
+    physical = [entry.effect for entry in power.effects if entry.kind == "physical"] or at_largest
+    # 0.1: power below which an effect counts as undetectable (chosen)
+    undetectable = [*dict.fromkeys([*(name for name in physical if at_largest[name] < 0.1), *power.not_testable])]
     # 6: undetectable effects that are named, at most (chosen)
     named = [*undetectable[:6], *(["others"] if len(undetectable) > 6 else [])]
     note = f"not even then: {listed_names(named)}" if named else ""
-    seen = f"by linear theory {detectable_count(power)} would have been detected with 90 % power at their largest"
-    return f"smaller effects: {seen} plausible size", note
+    seen = sum(probability >= 0.9 for probability in at_largest.values())
+    facts = {"seen": seen, "count": len(power.effects) + len(power.not_testable)}
+    return sentence("smaller_effects", facts), note
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
@@ -425,11 +431,7 @@ def explain(step: SelectionStep) -> str:
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
     if verdict == ARTEFACT and (others := best.names[1:]):
-        # Effects fitted beside a fault may describe more of the same fault.
-        text += (
-            f" {joined(others)} {'explains' if len(others) == 1 else 'explain'} what {best.names[0]} leaves, which may "
-            "be more of the same fault: repeat the diagnosis once it is corrected."
-        )
+        text += f" {sentence('beside_a_fault', {'fault': best.names[0], 'others': others})}"
     return text
 
 
@@ -498,24 +500,20 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
     if not step.unstated_differences:
         return text
     unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)
-    return (
-        f"{text} However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(unstated)}"
-        f" (Δχ² = {unstated.delta_chi2:.0f}).{remedies_in_words(step, [unstated])}"
-    )
+    facts = {"difference": difference_in_words(unstated), "gain": unstated.delta_chi2}
+    return f"{text} {sentence('trials_seem_to_differ', facts)}{remedies_in_words(step, [unstated])}"
 
 
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
-    pressures = [
-        f" {trial.name} moves as at {pressure_text(trial.implied_pressure_Pa, trial.unit)}, but"
-        f" {pressure_text(trial.stated_Pa, trial.unit)} is stated."
+    told = {
+        trial.name: [pressure_text(at_Pa, trial.unit) for at_Pa in (trial.implied_pressure_Pa, trial.stated_Pa)]
         for trial in odd
         if trial.implied_pressure_Pa > 0
-    ]
-    return (
-        f"{joined([trial.name for trial in odd])} {'is' if len(odd) == 1 else 'are'} inconsistent with the other"
-        f" {count - len(odd)} trials.{''.join(pressures)} Check sheet and recording; `use: no` leaves a trial out."
-    )
+    }
+    pressures = [f" {name} moves as at {implied}, but {stated} is stated." for name, (implied, stated) in told.items()]
+    facts = {"names": [trial.name for trial in odd], "others": count - len(odd), "pressures": "".join(pressures)}
+    return sentence("are_odd", facts)
 
 
 def odd_deciding_in_words(
