@@ -28,6 +28,8 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from pydantic_core import to_jsonable_python
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 
@@ -38,8 +40,8 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Checks of files before they are opened: only regular files are, since reading a pipe would block.
 
-# Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`
-NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
+# Message for a folder, a FIFO, a socket, a terminal or a device such as `/dev/zero`
+NOT_A_FILE = "it is a folder, a pipe or a device, not a file; put the file itself there, or a link to it"
 
 
 def missing_file_message(path: Path) -> tuple[str, str]:
@@ -53,8 +55,6 @@ def missing_file_message(path: Path) -> tuple[str, str]:
 def file_size(path: Path) -> int:
     """Return the size of a readable regular file."""
     size = path.stat().st_size
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
     if not path.is_file():
         raise OSError(errno.EINVAL, NOT_A_FILE, str(path))
     if not os.access(path, os.R_OK):
@@ -137,16 +137,14 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    r"""Read a text file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
+    r"""Read a text file in UTF-8 or UTF-16 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
     data = read_bytes(path)
-    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
-    if b"\x00" in data and not is_wide:
-        raise InputError("is not text", "save the table as CSV in UTF-8")
-    # Two characters of UTF-16 are none of UTF-32, whose mark begins with that of UTF-16.
-    for encoding in ("utf-32", "utf-16") if is_wide else ("utf-8-sig", "cp1252"):
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16",) if is_wide else ("utf-8-sig", "cp1252"):
         with contextlib.suppress(UnicodeDecodeError):
-            return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
-    raise InputError("is not readable as text", "save it as CSV in UTF-8")
+            if "\x00" not in (text := data.decode(encoding)):
+                return text.replace("\r\n", "\n").replace("\r", "\n")
+    raise InputError("is not text", "save the table as CSV in UTF-8")
 
 
 def read_table(path: Path) -> Table:
@@ -163,7 +161,17 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         # The separator that splits the header into most cells; headers contain no decimal commas.
         header = re.sub(r'"[^"]*"', "", next((line for line in lines if line.strip()), ""))
         delimiter = max("\t;,", key=header.count) if re.search("[\t;,]", header) else ","
-    records = [(line, cells) for line, cells in _records("\n".join(lines), delimiter) if any(cells)]
+    reader = csv.reader(
+        io.StringIO("\n".join(lines), newline=""), delimiter=delimiter, skipinitialspace=True, strict=True
+    )
+    records, start = [], 1
+    try:
+        for read in reader:
+            if any(cells := [cell.strip() for cell in read]):
+                records.append((start, cells))
+            start = reader.line_num + 1
+    except csv.Error as error:
+        raise InputError(f"is not a table (line {start}: {error})", "remove or close quotation marks") from None
     if not records:
         raise InputError("is empty", "its first line must name the columns")
     (_, columns), *body = records
@@ -180,19 +188,6 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         decimal=_find_decimal([cell for _, cells in body for cell in cells], delimiter),
         nameless=any(cell and not name for row in pairs for name, cell in row),
     )
-
-
-def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
-    """Split the text into records of stripped cells, each with the number of the line on which it starts."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True)
-    records, start = [], 1
-    try:
-        for cells in reader:
-            records.append((start, [cell.strip() for cell in cells]))
-            start = reader.line_num + 1
-    except csv.Error as error:
-        raise InputError(f"is not a table (line {start}: {error})", "remove or close quotation marks") from None
-    return records
 
 
 def _find_decimal(cells: list[str], delimiter: str) -> str:
@@ -250,31 +245,25 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text."""
-    from pydantic_core import to_jsonable_python
-
     plain = to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
     text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
     print(text) if path == STANDARD_OUTPUT else write_text(path, text + "\n")
 
 
+_adapter: Any = cache(TypeAdapter)
+
+
 class JsonRecord:
     """A dataclass that a JSON file holds, each field under its name or its alias; absent keys take their defaults."""
 
-    @classmethod
-    @cache
-    def _adapter(cls) -> Any:
-        from pydantic import TypeAdapter
-
-        return TypeAdapter(cls)
-
     def to_json(self) -> dict[str, Any]:
         """As the file holds it."""
-        return dict(self._adapter().dump_python(self, by_alias=True, warnings=False))
+        return dict(_adapter(type(self)).dump_python(self, by_alias=True, warnings=False))
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Self:
         """Read what `to_json` wrote."""
-        return cast(Self, cls._adapter().validate_python(entry))
+        return cast(Self, _adapter(cls).validate_python(entry))
 
 
 # ------------------------------------------------------------------------------

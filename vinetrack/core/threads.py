@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 
 def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function by numba; the compiled form is kept, unless no folder for it can be written."""
@@ -22,8 +24,6 @@ def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    from threadpoolctl import threadpool_limits
-
     with threadpool_limits(1, user_api="blas"):
         yield
 

@@ -27,8 +27,8 @@ GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol
 
 def decimals(sigma: float) -> int:
     """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN."""
-    # 12: derived: an error below 1e-11 is the rounding of a double of order 1e5
-    return min(max(1 - math.floor(math.log10(sigma)), 0), 12) if 0 < sigma < math.inf else 0
+    # Rounded first: 0.00999 is 0.010. 12: derived: an error below 1e-11 is the rounding of a double of order 1e5
+    return min(max(1 - math.floor(math.log10(float(f"{sigma:.1e}"))), 0), 12) if 0 < sigma < math.inf else 0
 
 
 def or_nan(value: Any) -> float:
@@ -53,7 +53,7 @@ def with_error(value: float | None, sigma: float | None) -> str:
     value, sigma = or_nan(value), or_nan(sigma)
     if not (math.isfinite(value) and 0 < sigma < math.inf):
         return number(value)
-    places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 rounds to 0.010
+    places = decimals(sigma)
     # 6: decimals beyond which value and error are written with a common power of ten (chosen)
     if places > 6:
         power = 3 * ((places - 1) // 3)
@@ -62,7 +62,7 @@ def with_error(value: float | None, sigma: float | None) -> str:
         scaled = 0.0 if abs(scaled) < 0.5 * 10.0**-shown else scaled  # no "-0.0"
         raised = str(power).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
         return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{raised}"
-    return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"
+    return f"{value:.{places}f} ± {sigma:.{places}f}"
 
 
 def interval(bounds: Sequence[float | None] | None) -> str:
@@ -79,8 +79,7 @@ def with_interval(value: float | None, bounds: Sequence[float | None] | None) ->
     low, high = map(or_nan, bounds or (None, None))
     if value is None or not math.isfinite(low + high):
         return number(value)
-    half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
-    places = min(decimals(half), 6) if half > 0 else 3
+    places = min(decimals((high - low) / 2), 6) if high > low else 3
     return f"{value:.{places}f} (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
