@@ -77,12 +77,8 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
     eligible = points[points["eligible"]]
     share = eligible.groupby("condition", sort=False)["used"].mean()
     few = points["condition"].isin(share[(share > 0) & (share < LEAST_STEADY_SHARE)].index) & points["used"]
-    words = [
-        f"only {share[condition]:.0%} of the trials of this condition are steady: the slower ones"
-        for condition in points.loc[few, "condition"]
-    ]
-    marked = points.copy()
-    marked.loc[few, "reason"] = words
+    marked, steady = points.copy(), points.loc[few, "condition"].map(share)
+    marked.loc[few, "reason"] = [f"only {part:.0%} of the trials of this condition are steady" for part in steady]
     marked.loc[few, "used"] = False
     return marked
 
@@ -351,9 +347,7 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     thickness = _families(table, "thickness_um", {"diameter_mm": SAME_WITHIN})
     reason = None
     if not isometric and not thickness:
-        few = ("no vine has a damping coefficient", "only one vine has a damping coefficient; it takes two")
-        none_alike = f"of {len(vines)} vines no two are scaled copies of each other or of equal diameter"
-        reason = [*few, none_alike][min(len(vines), 2)]
+        reason = f"of the vines with a B, {len(vines)}, no two are scaled copies of each other or of equal diameter"
     return {"method": "both_axes", "isometric": isometric, "thickness": thickness, "reason": reason}
 
 

@@ -150,14 +150,13 @@ def _onset(time_s: Floats, position_m: Floats, n_rest: int, origin_m: float, kin
 
 @dataclass(frozen=True)
 class SteadyForce:
-    """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure.
-    The latter is shared by all trials of a vine. `paper_N` is the force by the published rule: set pressure, no weight.
+    """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure,
+    which all trials of a vine share.
     """
 
     force_N: float
     sigma_N: float
     yield_sigma_N: float
-    paper_N: float
     window_pressure_Pa: float
     pressure_source: str  #: `trace` where it was measured in the window, else `set`
 
@@ -187,7 +186,6 @@ def steady_force(motion: TrialMotion, window: Window, model: Model) -> SteadyFor
         force_N=(pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N,
         sigma_N=sigma_Pa * trial.area_m2,
         yield_sigma_N=trial.yield_pressure_sigma_Pa * trial.area_m2,
-        paper_N=paper_force_N(trial),
         window_pressure_Pa=pressure_Pa,
         pressure_source=source,
     )

@@ -161,7 +161,7 @@ BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside 
 
 def gated_window(track: Track, kinematics: Kinematics, limits: SteadySettings, *, length_m: float = math.nan) -> Window:
     """Find the longest window in which the speed is shown to be constant within the drift limit."""
-    time_s, position_m = _points(track, kinematics)
+    time_s, position_m = _points(track)
     drift_limit = limits.drift_limit
     first, last, why = _gate(kinematics, limits)
     if why:
@@ -184,7 +184,7 @@ def user_window(
     track: Track, kinematics: Kinematics, window_s: tuple[float, float], limits: SteadySettings, length_m: float
 ) -> Window:
     """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady by these limits."""
-    time_s, position_m = _points(track, kinematics)
+    time_s, position_m = _points(track)
     inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
     if inside.size < 3:
         reason = (
@@ -206,13 +206,10 @@ def user_window(
     return replace(window, accepted=True, doubtful=bool(warnings), reason=reason)
 
 
-def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
-    """Times and raw positions at the points of the kinematics."""
+def _points(track: Track) -> tuple[Floats, Floats]:
+    """Times and raw positions at the usable points, which are those of the kinematics."""
     usable = track.usable
-    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
-    if not np.array_equal(time_s, kinematics.time_s):
-        raise ValueError("the kinematics were not made from this track; call estimate_kinematics on it again")
-    return time_s, position_m
+    return track.time_s[usable], track.lead_position_m[usable]
 
 
 def _gate(kinematics: Kinematics, limits: SteadySettings) -> tuple[int, int, str]:
@@ -311,8 +308,7 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
     """Find the window of the published rule: the longest run whose velocities vary by less than 3 %, wherever it is.
     Velocities are central differences of the raw positions, as Physics Tracker computes them.
     """
-    usable = track.usable
-    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    time_s, position_m = _points(track)
     if time_s.size < min_points + 2:
         return Window("paper", False, f"{time_s.size} points are too few for {min_points} central differences")
     velocity = (position_m[2:] - position_m[:-2]) / (time_s[2:] - time_s[:-2])
@@ -364,7 +360,7 @@ def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
     parts = 3  # parts of a window in which inertia is fitted separately (chosen)
     fewest_points = 4 * parts
     trial, kinematics = motion.trial, motion.kinematics
-    time_s, position_m = _points(motion.track, kinematics)
+    time_s, position_m = _points(motion.track)
     travel_m = position_m - motion.release.lead_position_m
     velocity = kinematics.lead_velocity_m_s
     first = int(np.argmax(velocity))

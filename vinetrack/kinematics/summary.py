@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -63,13 +64,11 @@ def condition_table(
     import pandas as pd
 
     measured = trials[trials["status"].isin(["ok", "warning"])]
-    by_condition: dict[str, list[Trial]] = {}
-    for trial in known:
-        by_condition.setdefault(trial.condition, []).append(trial)
+    first = {trial.condition: trial for trial in reversed(known)}
     tables = {name: group.set_index("trial") for name, group in measured.groupby("condition", sort=False)}
     rows = [
-        _row(members[0], tables[condition], final_at_fraction, efficiency_at_mm)
-        for condition, members in by_condition.items()
+        _row(first[condition], tables[condition], final_at_fraction, efficiency_at_mm)
+        for condition in dict.fromkeys(trial.condition for trial in known)
         if condition in tables
     ]
     return pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
@@ -131,10 +130,8 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
         return math.nan
-    i = int(beyond[0])
-    span_m = lead_position_m[i] - lead_position_m[i - 1]
-    part = (target_m - lead_position_m[i - 1]) / span_m if span_m > 0 else 0.0
-    return float(lead_velocity_m_s[i - 1] + part * (lead_velocity_m_s[i] - lead_velocity_m_s[i - 1]))
+    passing = slice(beyond[0] - 1, beyond[0] + 1)
+    return float(np.interp(target_m, lead_position_m[passing], lead_velocity_m_s[passing]))
 
 
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
@@ -189,16 +186,11 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class Steadiness:
-    """Windows by rule under one model, the chosen one, whose values are reported, and the force in it."""
+    """Windows by rule under one model, the one whose values are reported, NaN where there is none, and its force."""
 
     windows: Mapping[str, Window]
-    chosen: Window | None
+    window: Window
     force: SteadyForce | None
-
-    @property
-    def window(self) -> Window:
-        """The chosen window, or one whose numbers are NaN."""
-        return self.chosen or Window("", False, "")
 
 
 def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMotion:
@@ -232,7 +224,7 @@ def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
             windows["quasi_steady"] = quasi_steady_window(motion, pressure_Pa)
             chosen = _chosen(windows)
     force = steady_force(motion, chosen, model) if chosen else None
-    return Steadiness(windows, chosen, force)
+    return Steadiness(windows, chosen or Window("", False, ""), force)
 
 
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
@@ -255,7 +247,7 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         warnings.append(motion.release.reason)
     if "user" in windows and (windows["user"].doubtful or not windows["user"].accepted):
         warnings.append(windows["user"].reason)
-    notes = [*warnings, *([] if steady.chosen else [f"no steady window: {windows['gated'].reason}"])]
+    notes = [*warnings, *([] if steady.force else [f"no steady window: {windows['gated'].reason}"])]
     row = {
         "trial": trial.name,
         "vine": trial.vine,
@@ -328,10 +320,8 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings)
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
     motions = []
     for trial, track in pairs:
-        try:
+        with suppress(TrialError):
             motions.append(look_at_motion(trial, track, settings))
-        except TrialError:
-            continue
     return motions
 
 
