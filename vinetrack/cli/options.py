@@ -33,11 +33,6 @@ from vinetrack.experiment.schema import COLUMNS, Column, option
 START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
 
 
-def json_to_terminal(json_file: Path | None) -> bool:
-    """Whether JSON is printed to the terminal instead of lines."""
-    return json_file == STANDARD_OUTPUT
-
-
 @contextmanager
 def progress_line() -> Iterator[Callable[[str], None]]:
     """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
@@ -84,10 +79,8 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
 
 
 def _print_line(line: str, err: bool = False) -> None:
-    """Print a line; on a terminal, `error` and `warning` at its beginning have their colours."""
-    word, colon, rest = line.partition(":")
-    colour = {"error": "red", "warning": "yellow"}.get(word)
-    typer.echo(f"{typer.style(word, fg=colour, bold=True)}:{rest}" if colour and colon else line, err=err)
+    """Print a line; on a terminal, errors and warnings have their colours."""
+    typer.secho(line, fg={"error": "red", "warning": "yellow"}.get(line.partition(":")[0]), err=err)
 
 
 def _exit_with(message: str) -> None:
@@ -135,7 +128,7 @@ def command(
             log, json_file = values.pop("log", None), values.get("json")
             with errors_as_sentences(log):
                 with progress_line() as report:
-                    tools = {"say": partial(_print_line, err=json_to_terminal(json_file)), "report": report}
+                    tools = {"say": partial(_print_line, err=json_file == STANDARD_OUTPUT), "report": report}
                     named = {name: value for name, value in {**values, **tools}.items() if name in wanted}
                     if "options" in wanted:
                         options = {name: value for name, value in values.items() if name not in {*wanted, "json"}}
@@ -143,7 +136,7 @@ def command(
                     answer = function(**named)
                 if answer is not None:
                     lines, content, *failed = answer
-                    for text in () if json_to_terminal(json_file) else lines:
+                    for text in () if json_file == STANDARD_OUTPUT else lines:
                         _print_line(text)
                     if json_file is not None and content is not None:
                         write_json(json_file, content)

@@ -14,8 +14,6 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
 from vinetrack.core.units import pressure_text
 from vinetrack.figures.style import look
 from vinetrack.results.diagnosis_tables import DiagnosisTables, read_diagnosis_tables
@@ -185,8 +183,7 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
 
 def features(trial: Trial) -> list[str]:
     """Return sizes, pressure and payload of a trial in words."""
-    sizes = f"{1e3 * trial.diameter_m:g} mm"
-    sizes += f" × {1e6 * trial.thickness_m:.4g} µm" if np.isfinite(trial.thickness_m) else ""
-    sizes += f" × {1e3 * trial.length_m:.4g} mm" if np.isfinite(trial.length_m) else ""
+    others = (f"{1e6 * trial.thickness_m:.4g} µm", f"{1e3 * trial.length_m:.4g} mm")
+    sizes = " × ".join([f"{1e3 * trial.diameter_m:g} mm", *(size for size in others if not size.startswith("nan"))])
     payload = [f"{1e3 * trial.payload_kg:.3g} g"] if trial.payload_kg else []
     return [sizes, pressure_text(trial.pressure_Pa, trial.pressure_unit), *payload]
