@@ -97,6 +97,42 @@ def test_exports_of_a_straight_motion(tmp_path, header, separator, decimal, scal
     np.testing.assert_allclose(track.lead_position_m, POSITIONS, atol=2e-9)
 
 
+FPS, MM_PER_PX = 500.0, 0.4
+GROWN_M = 0.002 * np.arange(30) ** 1.3
+X_PX, Y_PX = 100 + 800 * GROWN_M / MM_PER_PX, 400 - 600 * GROWN_M / MM_PER_PX
+SHEET = {"capture_fps": FPS, "m_per_px": MM_PER_PX / 1e3}
+PIXELS = list(zip(X_PX.tolist(), Y_PX.tolist(), strict=True))
+DLC = "scorer" + ",net" * 6 + "\nbodyparts" + ",base" * 3 + ",tip" * 3 + "\ncoords" + ",x,y,likelihood" * 2 + "\n"
+FOREIGN = {
+    "trackpy": ",y,x,mass,ep,frame,particle\n"
+    + "".join(f"0,7,9,300,0.1,{i},0\n" * (i < 20) + f"1,{y},{x},310,,{i},3\n" for i, (x, y) in enumerate(PIXELS)),
+    "DeepLabCut": DLC + "".join(f"{i},5,6,{0.9 * (i < 20)},{x},{y},0.99\n" for i, (x, y) in enumerate(PIXELS)),
+    "Kinovea, ms": '"Time";"ball/0/X";"ball/0/Y"\r\n'
+    + "".join(f'"{i / FPS * 1e3:.2f}";"{x:.7f}";"{y:.7f}"\r\n'.replace(".", ",") for i, (x, y) in enumerate(PIXELS)),
+    "Kinovea, text": "#Kinovea Trajectory data export\n#T X Y\n\n# cup\n0 1 1\n0.002 1 1\n\n# tip\n"
+    + "".join(f"{i / FPS:.4f} {x} {y}\n" for i, (x, y) in enumerate(PIXELS)),
+    "DLTdv": "pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y\nNaN,NaN,NaN,NaN\n"
+    + "".join(f"{x},{y},NaN,NaN\n" for x, y in PIXELS),
+    "DLTdv in space": "pt1_X,pt1_Y,pt1_Z\n" + "".join(f"{0.6 * x},{y},{0.8 * x}\n" for x, y in PIXELS),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_table_of_another_program_is_read_with_rate_and_scale_of_the_sheet(tmp_path, name):
+    """Of several points the one with the most places; what is unlikely, or marked NaN, is none."""
+    path = write(tmp_path, FOREIGN[name])
+    track = read_track(path, **SHEET)
+    found = track.usable
+    np.testing.assert_allclose(np.diff(track.time_s), 1 / FPS, atol=1e-9)
+    np.testing.assert_allclose(np.ptp(track.lead_position_m[found]), np.ptp(GROWN_M), rtol=1e-5)
+    np.testing.assert_allclose(np.diff(track.lead_position_m[found]), np.diff(GROWN_M), atol=1e-9)
+    if "Kinovea" not in name:
+        with pytest.raises(InputError, match="capture_fps"):
+            read_track(path)
+    with pytest.raises(InputError):
+        read_track(path, point_mass="toe", **SHEET)
+
+
 def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path):
     """Out to +1 m and back to 0.2 m on the other side: the end counts as forwards."""
     there = np.array([0.0, 0.5, 0.9, 1.0, 0.9, 0.5, 0.1, -0.2])

@@ -4,7 +4,6 @@ figures by name; and `vt.fit`, `vt.diagnose`, `vt.power` and `vt.compare` for tr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,7 +41,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results import folder_layout
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
-from vinetrack.tracks.importers import flag_end_of_motion
+from vinetrack.tracks.importers import flag_end_of_motion, points_track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -229,26 +228,27 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
     >>> f"{trial.name}: {1e3 * trial.diameter_m:g} mm, {track.time_s.size} points"
     'P24_1: 24 mm, 224 points'
     """
-    position = next((name for name in POSITION_COLUMNS if name in frame), "")
-    absent = [name for name in ("trial", "time_s") if name not in frame] + ([] if position else ["lead_position_m"])
-    if absent:
+    position = next((name for name in (*POSITION_COLUMNS, "x", "y") if name in frame), "")
+    needed = ("trial",) if position in ("x", "y") else ("trial", "time_s", position or "lead_position_m")
+    if absent := [name for name in needed if name not in frame]:
         remedy = "a frame of tracks has trial, time_s, lead_position_m and the columns of a trial sheet"
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = {str(name): part for name, part in frame.groupby("trial", sort=False)}
-    table, _ = in_sheet_units(table_of_texts([_cells(name, part) for name, part in parts.items()]), "the frame")
+    cells = [_cells(name, part, position) for name, part in parts.items()]
+    table, _ = in_sheet_units(table_of_texts(cells), "the frame")
     made = planned_rows(table, ExperimentSettings(), REQUIRED_FOR_PREDICTION, file=Path("the frame"), measured=True)
     return [(trial, _track(trial, parts[trial.name], position)) for trial in made.trials]
 
 
-def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
+def _cells(name: str, part: pd.DataFrame, position: str) -> dict[str, str]:
     """Return the cells that a trial sheet would have for a trial: all columns but those of the track, as text."""
     cells = {"trial": name}
     of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
     for column in part.columns:
-        first = part[column].iloc[0]
-        if column in of_track or pd.isna(first) or first == "":
+        first, varies = part[column].iloc[0], len(part[column].unique()) > 1
+        if column in of_track or pd.isna(first) or first == "" or (varies and position in ("x", "y")):
             continue
-        if column != "pressure_kPa" and len(part[column].unique()) > 1:
+        if column != "pressure_kPa" and varies:
             message, remedy = f"changes within the trial {name}", "give it one value in all rows of the trial"
             raise ExperimentError([Problem(message=message, file="the frame", column=str(column), remedy=remedy)])
         cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
@@ -256,17 +256,17 @@ def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
 
 
 def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
-    unknown = np.full(len(part), math.nan)
-    sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
+    if position in ("x", "y"):
+        return flag_end_of_motion(trial, points_track(part.to_csv(index=False), trial))
+    known = {name: part[name].to_numpy(dtype=float) for name in ERROR_COLUMNS if name in part}
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1
     track = plain_track(
         part["time_s"].to_numpy(dtype=float),
         part[position].to_numpy(dtype=float),
-        lead_position_sigma_m=sigma_m,
         flag=flag,
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
-        lead_position_systematic_m=systematic_m,
+        **known,
     )
     return flag_end_of_motion(trial, track)
 

@@ -1,4 +1,4 @@
-"""Import positions measured elsewhere as a track: a CSV, a Physics Tracker project or its text export.
+"""Import positions measured elsewhere as a track: a CSV, a Physics Tracker project, or tables of other programs.
 
 A trial whose sheet names a `track` skips the video stages; this module reads what they would have produced. It depends
 on `records` and `tables` alone, so that the experiment's check can use it.
@@ -10,7 +10,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,7 +154,7 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
 
 
 # ------------------------------------------------------------------------------
-# Read files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
+# Read the projects of Physics Tracker (OSP): `.trk`, XML.
 #
 # A project stores the marks of a point mass in image pixels, frame by frame, and the axes: origin (px, image y
 # downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The transform to world coordinates
@@ -178,7 +178,13 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     panel = next((node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")), None)
     if panel is None:
         raise InputError("holds no Tracker panel", "save the project as .trk in Tracker")
-    name, marks, others = _choose_mass(panel, point_mass)
+    masses: dict[str, dict[int, tuple[float, ...]]] = {}
+    for node in panel.iter("object"):
+        if node.get("class", "").endswith(".PointMass"):
+            name = (_text(node, "name") or f"mass {len(masses) + 1}").strip()[:40]
+            masses[f"{name} {len(masses) + 1}" if name in masses else name] = _frame_values(node, "x", "y")
+    name, notes = _chosen({name: len(marks) for name, marks in masses.items()}, point_mass)
+    marks = masses[name]
     first, last = frames_used or (0, max(marks))
     marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
     if not marks:
@@ -186,9 +192,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     frames = np.array(sorted(marks))
     pixels = np.array([marks[frame] for frame in sorted(marks)])
     frame_s, start_s, start_frame = _clock(panel)
-    notes = []
-    if others and not point_mass:
-        notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
     unit = _text(panel, "length_unit").strip()
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
@@ -206,25 +209,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
         notes.append(f"{missing} frames between the first and the last point have none.")
     time_s = start_s + (frames - start_frame) * frame_s
     return new_track(time_s, position_m, [*notes, note], edge_px=edge_px)
-
-
-def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
-    """Name and marks (frame → px) of the point mass wanted, or of that with the most marks; names of the others."""
-    masses: list[tuple[str, dict[int, tuple[float, ...]]]] = []
-    for node in panel.iter("object"):
-        if node.get("class", "").endswith(".PointMass"):
-            name = _text(node, "name") or f"mass {len(masses) + 1}"
-            masses.append((name.strip()[:40], _frame_values(node, "x", "y")))
-    marked = [(name, marks) for name, marks in masses if marks]
-    if not marked:
-        raise InputError("holds no point mass with marks", "mark the leading edge as a point mass in Tracker")
-    named = [mass for mass in marked if not wanted or mass[0].casefold() == wanted.strip().casefold()]
-    if wanted and len(named) != 1:
-        names = ", ".join(repr(name) for name, _ in marked)
-        many = "several point masses" if named else "no point mass"
-        raise InputError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
-    best = max(named, key=lambda mass: len(mass[1]))
-    return *best, [name for name, marks in marked if marks is not best[1]]
 
 
 def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
@@ -287,39 +271,120 @@ def _number(node: Element, name: str) -> float:
     return value if abs(value) <= LARGEST_NUMBER else math.nan
 
 
-def _physics_tracker_column(cell: str) -> tuple[str, str]:
-    """Name (t, x, y or blank) and unit of a column of an export.
+# ------------------------------------------------------------------------------
+# Tables of points, a row a frame, as other programs write them: Tracker (`t, x, y`), trackpy (`y, x, …, frame,
+# particle`), DeepLabCut (`scorer`, `bodyparts`, `coords` above), Kinovea (`Time, ball/0/X, ball/0/Y`, or sections of
+# text), DLTdv (`pt1_cam1_X, …`, or `pt1_X, pt1_Y, pt1_Z`). What a file leaves open the sheet says: the rate by
+# `capture_fps`, the length of a pixel or of any other unit by `mm_per_px`. A note says what was taken for what.
 
-    >>> _physics_tracker_column("x (cm)"), _physics_tracker_column("#t")
-    (('x', 'cm'), ('t', ''))
+_COLUMN = re.compile(
+    r"#?\s*(?:(.+?)[\s_/]+)?(t|time|frame|x|y|z|likelihood)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE
+)
+
+
+def _column(cell: str) -> tuple[str, str, str]:
+    """Point, quantity (t, frame, x, y, z, likelihood, or blank) and unit of a column.
+
+    >>> [_column(cell) for cell in ("x (cm)", "#t", "pt1_cam1_X", "ball/0/Y", "mass")]
+    [('', 'x', 'cm'), ('', 't', ''), ('pt1_cam1', 'x', ''), ('ball/0', 'y', ''), ('', '', '')]
     """
-    pattern = r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?"
-    match = re.fullmatch(pattern, cell.strip().strip('"').strip(), re.IGNORECASE)
-    if match is None:
-        return "", ""
-    return {"time": "t"}.get(match[1].lower(), match[1].lower()), (match[2] or "")
+    match = _COLUMN.fullmatch(cell.strip().strip('"').strip())
+    return (match[1] or "", match[2].lower().replace("time", "t"), match[3] or "") if match else ("", "", "")
 
 
-def read_export(table: Table) -> Track:
-    """Read the track of Tracker's text export; a blank coordinate is a frame without a point."""
-    columns: dict[str, tuple[str, str]] = {}
+def _points_table(text: str) -> Table | None:
+    """The table of points in a text, its header in one line; None where there is none."""
+    lines = text.split("\n")
+    if lines[0].startswith("#Kinovea"):  # sections of lines `t x y`, each below `# name`
+        name, table = "", ["t;particle;x;y"]
+        for line in lines[2:]:
+            name = line.strip("# ") if line.startswith("#") else name
+            table += [";".join([cells[0], name, *cells[1:]]) for cells in [line.split()] if cells and line[0] != "#"]
+        return parse_table("\n".join(table))
+    heads = [line.partition(",")[0] for line in lines[:5]]
+    if heads[0] == "scorer" and "coords" in heads:
+        body = heads.index("coords") + 1
+        names = map(" ".join, zip(*(line.split(",")[1:] for line in lines[1:body]), strict=False))
+        return parse_table("\n".join([",".join(["frame", *names]), *lines[body:]]))
+    for skip, line in enumerate(lines[:20]):  # a title and remarks may stand above the header (chosen)
+        columns = [_column(cell) for cell in re.split(r"[\t;,]", line)]
+        found = {quantity for _, quantity, _ in columns}
+        if found & {"x", "y"} and (found & {"t", "frame"} or columns[0][0].startswith("pt")):
+            return parse_table(text, skip)
+    return None
+
+
+def points_track(text: str, trial: Trial) -> Track:
+    """Read the track of a trial from a table of points, as text."""
+    if (table := _points_table(text)) is None:
+        raise InputError("has no columns of points", "they are frame or t, and x, y or both")
+    return _read_points(table, trial.point_mass, trial.capture_fps, trial.m_per_px)
+
+
+def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float) -> Track:
+    """Read the track of one point: that of the name `wanted`, else that with the most places. A blank coordinate, or
+    one that DeepLabCut finds unlikely, is a frame without a place.
+    """
+    known = [{name: "" if cell.lower() == "nan" else cell for name, cell in row.items()} for row in table.rows]
+    table = replace(table, rows=tuple(known))
+    columns: dict[str, dict[str, tuple[str, str]]] = {}  # by point and quantity, with their units
     for column in table.columns:
-        name, unit = _physics_tracker_column(column)
-        columns.setdefault(name, (column, unit))
-    if "t" not in columns or not {"x", "y"} & columns.keys():
-        raise InputError("has no columns t and x or y", "export them from Tracker with one separator throughout")
-    time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"][1] or "s", "s"))
-    check_times(time_s, table.lines)
-    places = [columns[name] for name in ("x", "y") if name in columns]
-    axes = [table.numbers(column, blank_is_nan=True) * _factor(unit or "m", "m") for column, unit in places]
-    position_m, note = _project_on_axis(np.column_stack(axes))
-    missing = int(np.sum(~np.isfinite(position_m)))
-    notes = [rounded] if rounded else []
-    if missing:
+        of, quantity, unit = _column(column)
+        if quantity:
+            columns.setdefault("clock" if quantity in ("t", "frame") else of, {}).setdefault(quantity, (column, unit))
+    clock, particle = columns.pop("clock", {}), np.array([row.get("particle", "") for row in table.rows])
+    points = {}
+    for of, given in columns.items():
+        axes = [given[axis] for axis in "xyz" if axis in given]
+        places = np.column_stack([table.numbers(column, blank_is_nan=True) for column, _ in axes])
+        if "likelihood" in given:  # 0.6: from which DeepLabCut itself draws a point
+            places[table.numbers(given["likelihood"][0], blank_is_nan=True) < 0.6] = np.nan
+        for one in dict.fromkeys(particle.tolist()):
+            points[f"{of} {one}".strip()] = axes, np.flatnonzero(particle == one), places[particle == one]
+    counts = {name: int(np.isfinite(places).all(axis=1).sum()) for name, (_, _, places) in points.items()}
+    name, notes = _chosen(counts, wanted)
+    axes, rows, places = points[name]
+
+    column, time_unit = clock.get("t") or clock.get("frame") or ("the rows", "frames")
+    time = table.numbers(column)[rows] if clock else rows.astype(float)
+    factors = {"seconds": 1.0, "milliseconds": 1e-3, "frames": 1 / capture_fps}
+    if "t" not in clock:
+        time_unit = "frames"
+    elif not time_unit:  # that in which points are a frame apart
+        steps = {unit: float(np.median(np.diff(time))) * factor * capture_fps for unit, factor in factors.items()}
+        time_unit = next((unit for unit, step in steps.items() if abs(step - 1) < 0.05), "seconds")
+    time_s = time * (factors[time_unit] if time_unit in factors else _factor(time_unit, "s"))
+    if not np.isfinite(time_s).all():
+        raise InputError("states no times", "give the rate of its frames as capture_fps")
+    time_s, rounded = unrounded_times(time_s)
+    check_times(time_s, [table.lines[row] for row in rows])
+
+    unit, scale = axes[0][1], m_per_px
+    if unit:
+        scale = _factor(unit, "m")
+    elif ("t" in clock or len(axes) == 3) and not (name and math.isfinite(m_per_px)):
+        unit, scale = "metres", 1.0
+    elif not math.isfinite(m_per_px):
+        raise InputError("has its places in pixels", "give the length of a pixel as mm_per_px")
+    position_m, projected = _project_on_axis(places * scale)
+    source = f"{' and '.join(column for column, _ in axes)} in {unit or f'units of {1e3 * scale:g} mm'}"
+    notes += [f"Places are taken from {source}, times from {column} in {time_unit}.", rounded, projected]
+    if missing := int(np.sum(~np.isfinite(position_m))):
         notes.append(f"{missing} rows have no position.")
-    if not columns["t"][1] and not any(unit for _, unit in places):
-        notes.append("The export names no units; seconds and metres are assumed.")
-    return new_track(time_s, position_m, [*notes, note] if note else notes)
+    return new_track(time_s, position_m, list(filter(None, notes)))
+
+
+def _chosen(counts: Mapping[str, int], wanted: str) -> tuple[str, list[str]]:
+    """The point of the name `wanted`, else that with the most places, and a note of others."""
+    marked = {name: count for name, count in counts.items() if count}
+    if not marked:
+        raise InputError("holds no point with places", "mark the leading edge")
+    named = [name for name in marked if not wanted or name.casefold() == wanted.strip().casefold()]
+    if not named:
+        raise InputError(f"holds no point named {wanted!r}", f"point_mass is one of {', '.join(map(repr, marked))}")
+    best = max(named, key=marked.__getitem__)
+    others = ", ".join(name for name in marked if name != best)
+    return best, [f"Taken from {best!r}, which has the most points; not used: {others}."] * bool(others and not wanted)
 
 
 def _factor(unit: str, si: str) -> float:
@@ -333,7 +398,7 @@ def _factor(unit: str, si: str) -> float:
 
 def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     """Positions, (n,), along the principal axis of the motion, with a net displacement that is not negative, and a
-    sentence saying so, blank where nothing was done; NaN rows stay NaN. Shapes: points (n, 1 or 2).
+    sentence saying so, blank where nothing was done; NaN rows stay NaN. Shapes: points (n, 1 to 3).
     """
     known = np.all(np.isfinite(points), axis=1)
     if not known.any():
@@ -348,10 +413,10 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     position = (points - points[known][0]) @ axis
     if position[known][-1] < 0:
         axis, position = -axis, -position
-    stray = float(np.sqrt(np.mean((centred - np.outer(centred @ axis, axis)) ** 2) * 2))
-    degrees = math.degrees(math.atan2(axis[1], axis[0]))
+    stray = math.sqrt(np.mean(np.sum((centred - np.outer(centred @ axis, axis)) ** 2, axis=1)))
+    degrees = math.degrees(math.acos(min(abs(axis[0]), 1.0)))
     note = (
-        f"Points in a plane projected on the principal axis of their motion ({degrees:.1f}° from x); "
+        f"Points are projected on the principal axis of their motion ({degrees:.1f}° from x); "
         f"they stray {1000 * stray:.3g} mm rms from it."
     )
     return np.where(known, position, np.nan), note
@@ -401,7 +466,8 @@ def load_track(trial: Trial) -> Track:
     """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
     if trial.track is None:
         raise InputError("is blank", "this trial has a video, not a track")
-    track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
+    chosen: dict[str, Any] = {"point_mass": trial.point_mass, "frames_used": trial.frames_used}
+    track = read_track(trial.track, **chosen, capture_fps=trial.capture_fps, m_per_px=trial.m_per_px)
     return with_pressure_trace(trial, flag_end_of_motion(trial, track))
 
 
@@ -415,24 +481,29 @@ def with_pressure_trace(trial: Trial, track: Track) -> Track:
         raise InputError(f"pressure_trace {trial.pressure_trace.name} {error}") from None
 
 
-def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
-    """Read positions measured elsewhere; the kind of file is recognised from its content. Accepted are a CSV with
-    `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and Tracker's text export
-    (columns t, x, y or t and one coordinate, with or without a title above).
+def read_track(
+    path: Path,
+    *,
+    point_mass: str = "",
+    frames_used: tuple[int, int] | None = None,
+    capture_fps: float = math.nan,
+    m_per_px: float = math.nan,
+) -> Track:
+    """Read positions measured elsewhere; the kind of file is recognised from its content: a CSV with `time_s,
+    position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`), or a table of points of another program.
     """
     if path.suffix.lower() == ".trz":
         raise InputError("is a packed Tracker project", "unpack it and name the .trk inside")
     text = read_text(path)
     if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
         return read_project(text, point_mass, frames_used)
-    if point_mass:
-        raise InputError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
-    lines = text.split("\n")[:20]  # title and remarks stand above the header of a text export (chosen)
-    named = [{_physics_tracker_column(cell)[0] for cell in re.split(r"[\t;,]", line)} for line in lines]
-    skip = next((i for i, names in enumerate(named) if "t" in names and names & {"x", "y"}), None)
-    table = parse_table(text, skip or 0)
-    is_export = skip is not None and "position_m" not in table.columns
-    track = read_export(table) if is_export else _read_positions(table)
+    table = _points_table(text)
+    if table is not None and "position_m" not in table.columns:
+        track = _read_points(table, point_mass, capture_fps, m_per_px)
+    elif point_mass:
+        raise InputError("has no points to choose from", "leave point_mass blank, or name a file with points")
+    else:
+        track = _read_positions(parse_table(text))
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
