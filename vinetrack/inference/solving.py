@@ -197,8 +197,8 @@ def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
         notes.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
     elif weighted:
         notes.append(remark("weighted_as_stated"))
-    smoothed = dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None)
-    notes += [remark("smoothed", note=note) for note in smoothed]
+    smoothed = dict.fromkeys(trial_data.smoothing for trial_data in data if trial_data.smoothing is not None)
+    notes += [remark("smoothed", how=str(one), frames=one.decimation) for one in smoothed]
     return notes
 
 

@@ -272,7 +272,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     notes = list(experiment.blank_notes)
     rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in tracks])
     if smoothing := detect_smoothing(tracks, rounding_m):
-        notes.append(smoothing.note)
+        notes.append(str(remark("smoothed", how=str(smoothing), frames=smoothing.decimation)))
     if rounding_m > 0:
         notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))

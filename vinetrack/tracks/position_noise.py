@@ -46,14 +46,6 @@ class Smoothing:
         return f"{kind} over {self.window} frames"
 
     @property
-    def note(self) -> str:
-        """Sentence for the user."""
-        return (
-            f"positions look smoothed {self}: the model is smoothed in the same way, and one frame in"
-            f" {self.decimation} is used; give the positions as they were measured, which contain more information"
-        )
-
-    @property
     def weights(self) -> Floats:
         """Weight of each frame of the window in the value in its middle of a polynomial through them, shape (window,):
         that of Savitzky and Golay. SciPy has them too, but takes half a second to load.
@@ -469,36 +461,18 @@ def reject_outliers(track: Track) -> Track:
     outlying = outlying[~with_flag(track.flag[outlying], "corrected")] if outlying.size else outlying
     if not outlying.size:
         return track
-    places = _places(rejected := track.flagged(outlying, "rejected"), outlying)
+    rejected = track.flagged(outlying, "rejected")
+    around = track.time_s[rejected.usable], track.lead_position_m[rejected.usable]
+    off_m = track.lead_position_m[outlying] - np.interp(track.time_s[outlying], *around)
+    places = [f"{at_s:.5g} s ({1e3 * off:+.2g} mm)" for at_s, off in zip(track.time_s[outlying], off_m, strict=True)]
     return rejected.flagged([], "", f"far off the motion around, so left out: {', '.join(places)}")
 
 
 def rejected_points_note(tracks: Mapping[str, Track]) -> str:
-    """Name the rejected points of tracks by trial in one sentence; blank where there are none."""
-    places = [
-        f"{name} at {place}"
-        for name, track in tracks.items()
-        for place in _places(track, np.flatnonzero(["rejected" in str(flag) for flag in track.flag]))
-    ]
-    if not places:
-        return ""
-    most_named = 8  # a track's notes name all of its own
-    more = f" and {len(places) - most_named} more" if len(places) > most_named else ""
-    points = "1 point" if len(places) == 1 else f"{len(places)} points"
-    return f"{points} far off the motion around, so left out: {', '.join(places[:most_named])}{more}."
-
-
-def _places(track: Track, outlying: Indices) -> list[str]:
-    """Time of every rejected point and its distance from the line between its usable neighbours, in words."""
-    usable_rows = np.flatnonzero(track.usable)
-    distance_m = track.lead_position_m[outlying] - np.interp(
-        track.time_s[outlying], track.time_s[usable_rows], track.lead_position_m[usable_rows]
-    )
-    return [
-        f"{track.time_s[row]:.5g} s ({1e3 * off:+.2g} mm)"
-        for row, off in zip(outlying, distance_m, strict=True)
-        if math.isfinite(off)
-    ]
+    """Count the rejected points of tracks by trial in one sentence; blank where there are none."""
+    counts = {name: int(with_flag(track.flag, "rejected").sum()) for name, track in tracks.items()}
+    told = ", ".join(f"{count} of {name}" for name, count in counts.items() if count)
+    return f"Points far off the motion around are left out: {told}." if told else ""
 
 
 def _outlying(time_s: Floats, position_m: Floats, limit: float) -> Bools:
