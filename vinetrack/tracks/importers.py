@@ -335,7 +335,8 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
     clock, particle = columns.pop("clock", {}), np.array([row.get("particle", "") for row in table.rows])
     points = {}
     for of, given in columns.items():
-        axes = [given[axis] for axis in "xyz" if axis in given]
+        if not (axes := [given[axis] for axis in "xyz" if axis in given]):
+            continue
         places = np.column_stack([table.numbers(column, blank_is_nan=True) for column, _ in axes])
         if "likelihood" in given:  # 0.6: from which DeepLabCut itself draws a point
             places[table.numbers(given["likelihood"][0], blank_is_nan=True) < 0.6] = np.nan
@@ -351,8 +352,8 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
     if "t" not in clock:
         time_unit = "frames"
     elif not time_unit:  # that in which points are a frame apart
-        steps = {unit: float(np.median(np.diff(time))) * factor * capture_fps for unit, factor in factors.items()}
-        time_unit = next((unit for unit, step in steps.items() if abs(step - 1) < 0.05), "seconds")
+        step = capture_fps * float(np.median(np.diff(time))) if time.size > 1 else math.nan
+        time_unit = next((unit for unit, factor in factors.items() if abs(step * factor - 1) < 0.05), "seconds")
     time_s = time * (factors[time_unit] if time_unit in factors else _factor(time_unit, "s"))
     if not np.isfinite(time_s).all():
         raise InputError("states no times", "give the rate of its frames as capture_fps")
