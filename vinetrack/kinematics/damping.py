@@ -12,7 +12,7 @@ stated one and takes the speed with it (Berkson error). York's estimator then gi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -378,22 +378,24 @@ def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
-    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Returns
-    `slope, slope_95, intercept, intercept_95, R2, p, n`. Shapes: x, y (n,).
+    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Shapes: x,
+    y (n,).
     """
-    from scipy.stats import linregress
+    (intercept, slope), (intercept_95, slope_95), (_, p), r_squared = _least_squares([x], y)
+    line = {"slope": slope, "slope_95": slope_95, "intercept": intercept, "intercept_95": intercept_95}
+    return line | {"R2": r_squared, "p": p, "n": int(x.size)}
 
-    line = linregress(x, y)
-    half, half_intercept = _student(x.size - 2) * np.array([line.stderr, line.intercept_stderr])
-    return {
-        "slope": float(line.slope),
-        "slope_95": [float(line.slope - half), float(line.slope + half)],
-        "intercept": float(line.intercept),
-        "intercept_95": [float(line.intercept - half_intercept), float(line.intercept + half_intercept)],
-        "R2": float(line.rvalue**2),
-        "p": float(line.pvalue) if math.isfinite(line.pvalue) else math.nan,
-        "n": int(x.size),
-    }
+
+def _least_squares(columns: Iterable[Floats], y: Floats) -> tuple[list[float], list[list[float]], list[float], float]:
+    """Coefficients of a constant and of columns, their 95 % intervals and p-values by Student's t; and R²."""
+    matrix = np.column_stack([np.ones(y.size), *columns])
+    coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
+    residual, dof = y - matrix @ coefficients, y.size - matrix.shape[1]
+    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / dof)
+    half_widths = _student(dof) * errors
+    intervals = np.column_stack([coefficients - half_widths, coefficients + half_widths])
+    p = np.where(errors > 0, 2 * stdtr(dof, -np.abs(coefficients) / np.maximum(errors, 1e-300)), 0.0)
+    return coefficients.tolist(), intervals.tolist(), p.tolist(), _r_squared(y, residual)
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
@@ -508,17 +510,7 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
         refused = f"{words} vary together: neither power is identifiable"
     if refused:
         return {"refused": refused, "n": n, "R2": None}
-    y = np.log(values[known])
-    coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
-    residual = y - matrix @ coefficients
-    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / dof)
-    half_widths = _student(dof) * errors
-    powers_of = {
-        name: {
-            "power": float(coefficients[i]),
-            "power_95": [float(coefficients[i] - half_widths[i]), float(coefficients[i] + half_widths[i])],
-            "p": 2 * float(stdtr(dof, -abs(coefficients[i]) / errors[i])) if errors[i] > 0 else 0.0,
-        }
-        for i, name in enumerate(varying, start=1)
-    }
-    return {**powers_of, "R2": _r_squared(y, residual), "n": n, "refused": None}
+    powers, intervals, p, r_squared = _least_squares(varying.values(), np.log(values[known]))
+    of_sizes = zip(varying, powers[1:], intervals[1:], p[1:], strict=True)
+    powers_of = {name: {"power": power, "power_95": both, "p": one} for name, power, both, one in of_sizes}
+    return {**powers_of, "R2": r_squared, "n": n, "refused": None}
