@@ -58,22 +58,14 @@ def false_alarm_sentence(power: Power) -> str:
     return sentence("false_alarms", {"rate": power.false_alarm_rate})
 
 
-def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
+def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, ...]]:
     """Return a row for each effect, with the columns of `POWER_COLUMNS`."""
     rows = []
     for entry in effects:
         taken = ", ".join(f"{spaced_name(other)} {percent(rate)}" for other, rate in list(entry.taken_for.items())[:3])
-        rows.append(
-            (
-                spaced_name(entry.effect),
-                entry.symbol,
-                size_text(entry, entry.size_at(0.5)),
-                size_text(entry, entry.size_at(0.9)),
-                size_text(entry, entry.largest),
-                percent(entry.probability_at(entry.largest)),
-                taken or "–",
-            )
-        )
+        sizes = [size_text(entry, size) for size in (entry.size_at(0.5), entry.size_at(0.9), entry.largest)]
+        there = percent(entry.probability_at(entry.largest))
+        rows.append((spaced_name(entry.effect), entry.symbol, *sizes, there, taken or "–"))
     return rows
 
 
@@ -104,16 +96,15 @@ def simulated_lines(power: Power) -> list[str]:
     """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
     lines = []
     for rates in power.simulated:
-        low, high = map(percent, rates.interval)
-        rate = f"{rates.count} of {rates.campaigns} ({low} to {high} with 95 % confidence)"
+        facts = {name: getattr(rates, name) for name in ("count", "campaigns", "promised", "failed")}
+        facts |= {
+            "interval": " to ".join(map(percent, rates.interval)),
+            "names": [f"{a} {b}" for a, b in rates.named[:4]],
+        }
         if rates.effect:
             entry = power[rates.effect]
-            size = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"
-            what = f"{size}: detected in {rate}, {percent(rates.promised)} by linear theory"
-        else:
-            what = f"nothing missing: a false alarm in {rate}, at most {percent(rates.promised)} by the tests' levels"
-        what += f"; named: {', '.join(f'{names} {count}' for names, count in rates.named[:4])}" if rates.named else ""
-        lines.append(f"  {what}" + (f"; no verdict: {rates.failed}" if rates.failed else ""))
+            facts["what"] = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"
+        lines.append(f"  {sentence('simulated_effect' if rates.effect else 'simulated_null', facts)}")
     return ["Simulated campaigns, each diagnosed in full:", *lines] if lines else []
 
 

@@ -386,9 +386,7 @@ def bounds_text(entry: Number, with_unit: bool = False) -> str:
     unit, factor = display_unit(entry.unit)
     if not (is_finite(entry.low) and is_finite(entry.high)):
         return "open"
-    text = (
-        f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)}{f' {unit}' if with_unit else ''}".strip()
-    )
+    text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit if with_unit else ''}".strip()
     ends = entry.ends_at
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
