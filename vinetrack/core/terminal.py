@@ -41,8 +41,8 @@ def table(
 
 
 @contextmanager
-def waiting(description: str, total: int | None = None) -> Iterator[Progress]:
-    """A bar for work of `total` steps, or of unknown length, with the elapsed time."""
+def waiting(description: str) -> Iterator[Progress]:
+    """A bar for work of unknown length, with the elapsed time."""
     from rich import progress as rich
     from rich.console import Console
 
@@ -50,7 +50,7 @@ def waiting(description: str, total: int | None = None) -> Iterator[Progress]:
     screen = Console(stderr=True, markup=False, emoji=False, highlight=False)
     times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn(compact=True)
     with rich.Progress(*columns, *times, console=screen, transient=True, disable=not sys.stderr.isatty()) as bar:
-        bar.add_task(description, total=total)
+        bar.add_task(description, total=None)
         yield bar
 
 
