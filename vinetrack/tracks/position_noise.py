@@ -470,7 +470,8 @@ def reject_outliers(track: Track) -> Track:
 
 def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     """Count the rejected points of tracks by trial in one sentence; blank where there are none."""
-    counts = {name: int(with_flag(track.flag, "rejected").sum()) for name, track in tracks.items()}
+    # What lies before the frames that a person chose is flagged so too.
+    counts = {name: with_flag(one.flag[np.argmax(one.usable) :], "rejected").sum() for name, one in tracks.items()}
     told = ", ".join(f"{count} of {name}" for name, count in counts.items() if count)
     return f"Points far off the motion around are left out: {told}." if told else ""
 
