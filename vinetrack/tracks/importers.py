@@ -51,11 +51,9 @@ def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     wrong = np.flatnonzero((pressure_kPa > 1000.0) | (pressure_kPa < -101.4))
     if len(wrong):
         value = float(pressure_kPa[wrong[0]])
-        where = f"line {lines[wrong[0]]}, column pressure_kPa: {value:g}"
-        if value < 0:
-            raise InputError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
-        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1e6 else ""
-        raise InputError(f"{where} is above 1000 kPa{hint}")
+        hint = f"; {value:g} Pa are {value / 1000:g} kPa" if 1000 < value < 1e6 else ""
+        message = f"line {lines[wrong[0]]}, column pressure_kPa: {value:g} is below vacuum or above 1000 kPa"
+        raise InputError(message, f"gauge pressure in kPa is wanted{hint}")
 
 
 def new_track(time_s: Floats, lead_position_m: Floats, notes: Sequence[str], **known: Any) -> Track:
@@ -85,13 +83,12 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     """
     if time_s.size < 8 or not np.isfinite(time_s).all():
         return time_s, ""
-    for digits in range(7):  # with more decimals a time does not count as rounded
-        scaled = time_s * 10.0**digits
-        if np.max(np.abs(scaled - np.round(scaled))) < 1e-6 * max(1.0, float(np.max(np.abs(scaled))) * 1e-6):
-            digit_s = float(10.0**-digits)
-            break
-    else:
+    scaled = time_s * 10.0 ** np.arange(7)[:, None]  # with more decimals a time does not count as rounded
+    off = np.max(np.abs(scaled - np.round(scaled)), axis=1)
+    rounded = np.flatnonzero(off < 1e-6 * np.maximum(1.0, 1e-6 * np.max(np.abs(scaled), axis=1)))
+    if not rounded.size:
         return time_s, ""
+    digit_s = 10.0 ** -float(rounded[0])
     place = np.arange(time_s.size, dtype=float)
     step_s, first_s = np.polyfit(place, time_s, 1)
     even_s = first_s + step_s * place
@@ -99,8 +96,8 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     # Times must lie within 3/4 of their last digit, which matters from 1 % of a frame on.
     if not step_s > 0 or off_s > 0.75 * digit_s or off_s < 0.005 * step_s:
         return time_s, ""
-    rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
-    return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are used instead."
+    spacing = f"{1e3 * step_s:.3g} ms apart"
+    return even_s, f"Times are rounded to {1e3 * digit_s:g} ms; evenly spaced ones, {spacing}, are used instead."
 
 
 # ------------------------------------------------------------------------------
@@ -231,10 +228,9 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
     if not values:
         raise InputError("holds no coordinate system", "calibrate it in Tracker")
-    if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in values.values()):
-        raise InputError("holds a scale that is not positive", "calibrate it anew in Tracker")
-    if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
-        raise InputError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
+    scales = np.array(list(values.values()))[:, 3:]
+    if np.any(scales <= 0) or np.all(scales == 1):
+        raise InputError("was never calibrated: 1 pixel is 1 m, or less", "set a calibration stick or tape in Tracker")
     return values
 
 
@@ -402,13 +398,8 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     sentence saying so, blank where nothing was done; NaN rows stay NaN. Shapes: points (n, 1 to 3).
     """
     known = np.all(np.isfinite(points), axis=1)
-    if not known.any():
-        return np.full(len(points), np.nan), ""
     if np.max(np.abs(points[known])) > LARGEST_NUMBER:
         raise InputError("holds a position too large to be one", "correct it")
-    if points.shape[1] == 1:
-        net = points[known][-1, 0] - points[known][0, 0]
-        return (-points[:, 0], "Turned round so that position grows.") if net < 0 else (points[:, 0], "")
     centred = points[known] - points[known].mean(axis=0)
     axis = np.linalg.svd(centred, full_matrices=False)[2][0]
     position = (points - points[known][0]) @ axis

@@ -202,7 +202,7 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     )
     typical = noises[len(noises) // 2] if noises else 0.0
     # 0.01: relative difference within which two rounding steps are the same (chosen)
-    n_same = sum(typical * (1 - 0.01) <= noise <= typical * (1 + 0.01) for noise in noises)
+    n_same = np.isclose(noises, typical, rtol=0.01, atol=0).sum()
     return typical if 2 * n_same > len(noises) else 0.0
 
 
