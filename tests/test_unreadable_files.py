@@ -162,7 +162,7 @@ def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path):
         assert "Error(" not in said
         # A link that leads to itself is a file that is missing, and a picture may be.
         if kind != "itself":
-            assert "it is a pipe or a device, not a file" in said, (place, kind)
+            assert "a folder, a pipe or a device, not a file" in said, (place, kind)
         assert int(status) == (0 if (place, kind) == ("picture of a recording", "itself") else 1), (place, kind)
 
 
