@@ -248,7 +248,7 @@ class Batch:
         count = self.starts.size - 1
         out, ends = np.empty((self.stamps.size, 4)), np.empty((count, 5))
         # For fewer than 64 trials another thread costs more than it saves.
-        threads = min(numba.config.NUMBA_NUM_THREADS, count // 64)
+        threads = min(numba.config.NUMBA_NUM_THREADS, count // 64)  # type: ignore[attr-defined]
         longest = int(np.diff(self.starts).max(initial=0))
 
         def integrate(first: int, last: int) -> None:
