@@ -87,7 +87,7 @@ from vinetrack.effects import Parameter
 PARAMETERS = (Parameter("k", "k", "N/m", 500.0, bounds=(0.0, 1e4)),)
 def tail_force(s, rig, k):
     return k * max(s.lead_position - 0.1, 0.0)
-def breakpoints(rig, k):
+def breakpoints(rig):
     return (0.1,)
 '''
 

@@ -16,7 +16,6 @@ from dataclasses import fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -116,13 +115,16 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
     text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
     capitals = {field.name.upper(): field.name for field in fields(Effect)}
     given = {capitals[name]: value for name, value in vars(module).items() if name in capitals}
+    breakpoints = of_rig = getattr(module, "breakpoints", None)
+    if of_rig is not None and len(inspect.signature(of_rig).parameters) == 1:
+        breakpoints = lambda rig, *_: of_rig(rig)  # noqa: E731
     given |= {
         "name": path.stem,
         "summary": text.partition("\n")[0].strip(),
         "text": text,
         "functions": {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))},
         "path": path.resolve(),
-        "breakpoints": getattr(module, "breakpoints", None),
+        "breakpoints": breakpoints,
     }
     return _adapter().validate_python(given)
 
@@ -236,14 +238,13 @@ def _fault_in_motion(effect: Effect, _text: bytes) -> str:
     from numba import njit
     from numba.core.errors import NumbaError
 
-    flags: dict[str, Any] = {"_nrt": False}
     values, hook = [parameter.default for parameter in effect.parameters], "breakpoints"
     try:
         if effect.breakpoints is not None:
             list(map(float, effect.breakpoints(_RIG, *values)))
         for hook, function in effect.functions.items():  # noqa: B007
             function(_STATE, _RIG, *values)
-            njit(**flags)(function)(_STATE, _RIG, *values)
+            njit(_nrt=False)(function)(_STATE, _RIG, *values)  # type: ignore[call-overload]
     except NumbaError:
         return f"{hook} cannot be compiled: it may use numbers, functions of math and numpy, and fields of s and rig"
     except Exception as error:
