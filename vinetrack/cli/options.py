@@ -79,8 +79,9 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
 
 
 def _print_line(line: str, err: bool = False) -> None:
-    """Print a line; on a terminal, errors and warnings have their colours."""
-    typer.secho(line, fg={"error": "red", "warning": "yellow"}.get(line.partition(":")[0]), err=err)
+    """Print a line; on a terminal that wants colours, errors and warnings have theirs."""
+    colour = {"error": "red", "warning": "yellow"}.get(line.partition(":")[0])
+    typer.secho(line, fg=None if os.environ.get("NO_COLOR") else colour, err=err)
 
 
 def _exit_with(message: str) -> None:

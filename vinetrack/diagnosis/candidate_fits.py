@@ -183,7 +183,8 @@ class CandidateFits:
             credible = [known for known in self.fitted.values() if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
             model = self.tests.fit.model.with_effects((shape.effect,))
-            fit = full_fit(self.tests.fit, model, start=start_values(shape, size), best=best)
+            near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
+            fit = full_fit(self.tests.fit, model, start=start_values(shape, size), best=best, once=near)
             hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, (shape.effect,), fit)
             if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:
                 self.failed.add(name)

@@ -86,20 +86,27 @@ def solve_from(
     **how: Any,
 ) -> Solution:
     """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`;
-    `how` are options of `solve`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
+    `how` are options of `_solve_or_alike`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
     state = first_state(predictor.data, theta, trial_effects)
     return _solve_or_alike(predictor, make_problem(predictor, trial_effects), state, fixed_terms, **how)
 
 
 def _solve_or_alike(
-    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, **how: Any
+    predictor: Predictor,
+    problem: MixedProblem,
+    state: FitState,
+    fixed_terms: FixedTerms,
+    *,
+    once: bool = False,
+    **how: Any,
 ) -> Solution:
-    """Solve, and where the fit is poor, with trials that are alike: differences between them in pressure and B take up
-    what a model lacks, and n is meaningless then. From there trials may differ again, if that leads near the tracks.
+    """Solve, and where the fit is poor, unless it is to be tried `once`, with trials that are alike: differences
+    between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials may differ
+    again, if that leads near the tracks.
     """
     solution = solve(predictor, problem, state, fixed_terms, **how)
-    if fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
+    if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
         return solution
     # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
     try:
@@ -114,8 +121,8 @@ def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `solve`. From bad starting values the fit descends with the noise fixed first, since their misfit
-    would be absorbed as noise and stall the optimiser. Shapes: theta (n_free,).
+    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, since their
+    misfit would be absorbed as noise and stall the optimiser. Shapes: theta (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
