@@ -542,7 +542,7 @@ for _ in range(60):
     seen = iter([np.zeros((320, 960), np.uint8)] * 2)
     frames.luma_plane = lambda frame: next(seen)
     try:
-        frames.decode_container(film, 60)
+        frames.read_frames(film)
     except (StopIteration, RuntimeError):
         pass
 """

@@ -13,7 +13,7 @@ import math
 import os
 import threading
 from collections.abc import Container, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -40,68 +40,35 @@ NON_MARKING_DECODERS = frozenset(
 )
 
 
-@dataclass
-class Decoded:
-    """Decoded frames in display order, with their times in ticks of the film (NaN where unknown) and types. `pictures`
-    has shape (n_frames, height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key frames,
-    `between` B frames, which are coded from later frames too.
+class Shot(NamedTuple):
+    """What is known of a picture: its time in ticks (NaN where unknown), whether it is `corrupt`, a `key` frame, or one
+    `between` others (a B frame), which is coded from later frames too.
     """
 
-    pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
-    ticks: list[float] = field(default_factory=list)
-    corrupt: list[bool] = field(default_factory=list)
-    key: list[bool] = field(default_factory=list)
-    between: list[bool] = field(default_factory=list)
-    messages: list[str] = field(default_factory=list)
+    tick: float
+    corrupt: bool = False
+    key: bool = True
+    between: bool = False
 
 
-def decode_container(recording: Recording, count: int, between: tuple[int, int] | None = None) -> Decoded:
-    """Decode every frame, or those from a tick to another. Memory is taken for `count` frames, or for more where they
-    come.
-    """
-    decoded = Decoded()
-    first, last = between or (None, math.inf)
-
-    def pictures() -> Generator[NDArray[Any]]:
-        for frame, is_corrupt in film_frames(recording.path, said, begin=first):
-            if first is not None and (frame.pts is None or frame.pts < first):
-                continue
-            if frame.pts is not None and frame.pts > last:
-                return
-            if (frame.height, frame.width) != (recording.height, recording.width):
-                said.append((0, "", "the size of the picture changes"))
-                return
-            picture = luma_plane(frame)
-            decoded.ticks.append(math.nan if frame.pts is None else frame.pts)
-            decoded.corrupt.append(is_corrupt)
-            decoded.key.append(bool(frame.key_frame))
-            decoded.between.append(frame.pict_type == 3)  # 3: code of a B frame (defined)
-            yield picture
-
-    with quiet_log() as said, contextlib.closing(pictures()) as taken:
-        decoded.pictures = filled(recording, taken, count)
-    decoded.messages = [message.strip() for *_, message in said]
-    return decoded
-
-
-def film_frames(
-    path: Path, said: list[Said], begin: int | None = None, chosen: Container[int] | None = None
-) -> Iterator[tuple[av.VideoFrame, bool]]:
-    """Decode a film, from the key frame before a tick on, or the packets of chosen ticks alone, and say whether each
-    frame is corrupt: as the decoder marks it, or as it says of the packet in `said`, to which it adds what it says. A
-    packet that cannot be decoded costs only its own frame.
+def film_shots(
+    recording: Recording, said: list[Said], span: tuple[int, int] | None = None, chosen: Container[int] | None = None
+) -> Generator[tuple[NDArray[Any], Shot]]:
+    """Decode a film: all of it, from a tick to another, or the packets of chosen ticks alone. A frame is corrupt as the
+    decoder marks it, or as it says of the packet in `said`, to which it adds what it says. A packet that cannot be
+    decoded costs only its own frame.
     """
     import av
 
     try:
-        with open_film(path) as container:
+        with open_film(recording.path) as container:
             stream = container.streams.video[0]
             marks = stream.codec_context.name not in NON_MARKING_DECODERS
             faulty: set[int | None] = set()
             # With one thread each message belongs to the packet that is decoded.
             stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS if marks else 1
-            if begin is not None:
-                container.seek(max(begin, 0), stream=stream)
+            if span is not None:
+                container.seek(max(span[0], 0), stream=stream)
             for packet in container.demux(stream):
                 if chosen is not None and packet.size and packet.pts not in chosen:
                     continue
@@ -115,23 +82,33 @@ def film_frames(
                 if len(said) > heard and not marks:
                     faulty.add(packet.pts)
                 for frame in frames:
-                    yield frame, bool(frame.is_corrupt) or frame.pts in faulty
+                    tick = math.nan if frame.pts is None else frame.pts
+                    if span is not None and not tick >= span[0]:
+                        continue
+                    if span is not None and tick > span[1]:
+                        return
+                    if (frame.height, frame.width) != (recording.height, recording.width):
+                        said.append((0, "", "the size of the picture changes"))
+                        return
+                    is_corrupt = bool(frame.is_corrupt) or frame.pts in faulty
+                    # 3: code of a B frame (defined)
+                    yield luma_plane(frame), Shot(tick, is_corrupt, bool(frame.key_frame), frame.pict_type == 3)
     except av.error.FFmpegError as error:
         said.append((0, "", str(error.strerror or error)))
 
 
-def damaged_frames(decoded: Decoded, slot: Indices) -> Bools:
+def damaged_frames(shots: Sequence[Shot], slot: Indices, complained: bool) -> Bools:
     """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,). A decoder marks only the frame in
     which it met the fault. The frames after it are coded as differences from it and are equally wrong, without a
-    message, until the next key frame. Shapes: slot (n_frames,) → (n_frames,).
+    message, until the next key frame; where the decoder `complained`, so are those after lost ones. Shapes: slot
+    (n_frames,) → (n_frames,).
     """
-    damaged = np.array(decoded.corrupt, dtype=bool)
-    if decoded.messages:
-        damaged[1:] |= (np.diff(slot) > 1) & ~np.array(decoded.key[1:], dtype=bool)
+    damaged = np.array([shot.corrupt for shot in shots], dtype=bool)
+    after_lost = complained & (np.diff(slot, prepend=slot[0]) > 1)
     for i in range(1, len(damaged)):
-        damaged[i] |= damaged[i - 1] and not decoded.key[i]
+        damaged[i] |= not shots[i].key and (after_lost[i] or damaged[i - 1])
     for i in range(len(damaged) - 2, -1, -1):
-        damaged[i] |= damaged[i + 1] and decoded.between[i]
+        damaged[i] |= damaged[i + 1] and shots[i].between
     return damaged
 
 
@@ -318,13 +295,61 @@ def inspect_recording(path: Path | str) -> Recording:
 def read_frames(
     path: Path | str | Recording, part: tuple[int, int] | None = None, index: PacketIndex | None = None
 ) -> Frames:
-    """Decode all frames of a recording, or those from a frame to another; a part of a film needs its index."""
+    """Decode all frames of a recording, or those from a frame to another; a part of a film needs its index. Frames that
+    cannot be read are left out, or partial or black, and marked damaged.
+    """
     recording = path if isinstance(path, Recording) else inspect_recording(path)
-    if recording.kind == "container":
-        return _read_film(recording, part, index)
-    from vinetrack.video.images import read_images
+    name, notes, declared = recording.path.name, list(recording.notes), recording.declared_frames or 0
+    shots: list[Shot] = []
 
-    return read_images(recording, part)
+    def pictures() -> Iterator[NDArray[Any]]:
+        for picture, shot in taken:
+            shots.append(shot)
+            yield picture
+
+    # 256: frames for which memory is reserved if a film does not declare their number (chosen)
+    count = part[1] - part[0] + 1 if part else declared or 256
+    with quiet_log() as said, contextlib.closing(shots_of(recording, said, part, index)) as taken:
+        luma = filled(recording, pictures(), count)
+    if not len(luma):
+        raise RecordingError("not one frame can be read", "copy it from the camera again", name)
+    times, number = np.array([shot.tick for shot in shots]), np.arange(len(shots))
+    if part is not None and recording.raw is not None:
+        number, times = part[0] + number, recording.raw.times
+    elif part is not None and index is not None:
+        number, times = np.searchsorted(index.ticks, times), index.ticks
+    if len(times) < declared:
+        notes.append(
+            f"{name}: {len(times)} frames are there where the file declares {declared}: cut short or damaged; copy it "
+            "from the camera again"
+        )
+    slots, irregular = slots_from_times(times, max(declared - len(times), 0))
+    first, last = int(number[0]), int(number[-1])
+    slots = np.concatenate([slots[:first], slots[number], slots[last + 1 :]])
+    damaged = damaged_frames(shots, slots[first : first + len(luma)], bool(said))
+    if said or damaged.any():
+        messages = f" ({len(said)} messages; the first: {said[0][2].strip()})" if said else ""
+        notes.append(
+            f"{name}: damaged: {int(damaged.sum())} of {len(luma)} frames are corrupt, cut short or coded from such"
+            + messages
+        )
+    if len(luma) < len(times):
+        around = f"of {len(times)} frames only {first} to {last}, around the motion, are read"
+        notes.append(f"{name}: {around}; choose others in frames_used")
+    notes += [f"{name}: {irregular}"] if irregular else []
+    return Frames(recording, luma, slots, damaged, tuple(notes), first)
+
+
+def shots_of(
+    recording: Recording, said: list[Said], part: tuple[int, int] | None = None, index: PacketIndex | None = None
+) -> Generator[tuple[NDArray[Any], Shot]]:
+    """Read one picture after another, of the whole recording or from a frame to another; see `read_frames`."""
+    if recording.kind == "container":
+        span = (int(index.ticks[part[0]]), int(index.ticks[part[1]])) if part and index else None
+        return film_shots(recording, said, span)
+    from vinetrack.video.images import picture_shots
+
+    return picture_shots(recording, said, part)
 
 
 def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -> NDArray[Any]:
@@ -354,13 +379,8 @@ def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -
 
 def iterate_frames(recording: Recording) -> Iterator[NDArray[Any]]:
     """Yield one frame after another, as copies."""
-    if recording.kind == "container":
-        for frame, _ in film_frames(recording.path, []):
-            yield luma_plane(frame)[: recording.height, : recording.width].copy()
-        return
-    from vinetrack.video.images import pictures_of
-
-    yield from (picture for picture, _ in pictures_of(recording))
+    for picture, _ in shots_of(recording, []):
+        yield picture.copy()
 
 
 def luma_plane(frame: av.VideoFrame) -> NDArray[Any]:
@@ -411,53 +431,6 @@ def _inspect_container(path: Path) -> Recording:
         if is_film and "moov atom not found" in " ".join([*(text for *_, text in said), str(error)]):
             why = "cut short: the index that is written last is missing", "copy the file again, or repair it"
         raise RecordingError(*why, path.name) from error
-
-
-def _read_film(recording: Recording, part: tuple[int, int] | None, index: PacketIndex | None) -> Frames:
-    """Decode a film, or a part of it by its index."""
-    name, notes, declared = recording.path.name, list(recording.notes), recording.declared_frames or 0
-    if part is None or index is None:
-        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
-        decoded = decode_container(recording, declared or 256)
-        ticks, number = np.array(decoded.ticks), np.arange(len(decoded.ticks))
-    else:
-        first, last = part
-        decoded = decode_container(recording, last - first + 1, (int(index.ticks[first]), int(index.ticks[last])))
-        ticks, number = index.ticks, np.searchsorted(index.ticks, decoded.ticks)
-    n = len(number)
-    if n == 0:
-        raise RecordingError("not one frame can be decoded", "the file is damaged", name)
-    if len(ticks) < declared:
-        notes.append(
-            f"{name}: {len(ticks)} frames are there where the file declares {declared}: cut short or damaged; copy it "
-            "from the camera again"
-        )
-    frames = frames_at(recording, decoded.pictures, ticks, number, lost=max(declared - len(ticks), 0))
-    damaged = damaged_frames(decoded, frames.slot)
-    if decoded.messages or damaged.any():
-        first_message = f"; the first: {decoded.messages[0]}" if decoded.messages else ""
-        notes.append(
-            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or coded from corrupt ones"
-            f" ({len(decoded.messages)} messages of the decoder{first_message})"
-        )
-    return replace(frames, damaged=damaged, notes=(*notes, *frames.notes))
-
-
-def frames_at(recording: Recording, luma: NDArray[Any], times: NDArray[Any], number: Indices, lost: int = 0) -> Frames:
-    """Frames, none of them damaged, that are the `number`s of those of a recording at these times, in any unit; as many
-    as `lost` are known to be missing. Shapes: luma (n_frames, height, width); number (n_frames,); times (n_recorded,).
-    """
-    slots, irregular = slots_from_times(times, lost)
-    notes, first, last = [], int(number[0]), int(number[-1])
-    if len(number) < len(times):
-        notes.append(
-            f"of {len(times)} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
-        )
-    notes += [irregular] if irregular else []
-    return Frames(
-        recording, luma, np.concatenate([slots[:first], slots[number], slots[last + 1 :]]),
-        np.zeros(len(luma), dtype=bool), tuple(f"{recording.path.name}: {note}" for note in notes), first,
-    )  # fmt: skip
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[Indices, str]:
@@ -527,6 +500,12 @@ class RawFrames:
     linearise: bool = False
     mosaic: bool = False
     times_s: Floats | None = None
+
+    @property
+    def times(self) -> NDArray[Any]:
+        """Times of the frames, in seconds where the camera stamped them, else their numbers."""
+        n = len(self.offsets)
+        return np.arange(n) if self.times_s is None else self.times_s[:n]
 
     @property
     def frame_bytes(self) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,12 +18,11 @@ from vinetrack.core.records import SIDE_FILES, Floats, Trial
 from vinetrack.core.tables import NOT_A_FILE, file_size
 from vinetrack.video.frames import (
     IMAGES,
-    Frames,
     RawFrames,
     Recording,
     RecordingError,
-    filled,
-    frames_at,
+    Said,
+    Shot,
     mosaic_brightness,
     unpack_pixels,
 )
@@ -341,54 +341,34 @@ def inspect_images(path: Path) -> Recording:
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
 
-def read_images(recording: Recording, part: tuple[int, int] | None = None) -> Frames:
-    """Read every picture, or a part of a camera's own file; one that is truncated or cannot be read is partial or
-    black, and marked damaged.
+def picture_shots(
+    recording: Recording, said: list[Said], part: tuple[int, int] | None = None
+) -> Generator[tuple[NDArray[Any], Shot]]:
+    """Each picture, of a camera's own file from a frame to another. One that cannot be read is black, and `said` so; a
+    stack ends before it.
     """
-    name, raw, whole, notes = recording.path.name, recording.raw, list[bool](), list(recording.notes)
-    count = len(raw.offsets) if raw else recording.declared_frames or 0
-    first, last = part or (0, count - 1)
-    wanted = replace(recording, raw=replace(raw, offsets=raw.offsets[first : last + 1])) if raw else recording
-
-    def pictures() -> Iterator[NDArray[Any]]:
-        for picture, is_whole in pictures_of(wanted):
-            whole.append(is_whole)
-            yield picture
-
-    luma = filled(recording, pictures(), last - first + 1)
-    damaged, expected = ~np.array(whole, dtype=bool), last - first + 1 if part else recording.declared_frames or 0
-    if damaged.all():
-        raise RecordingError("not one picture can be read", "copy it from the camera again", name)
-    if len(luma) < expected:
-        notes.append(f"{name}: {len(luma)} pictures are there where {expected} are declared: cut short")
-    if damaged.any():
-        victim = recording.files[int(np.argmax(damaged))].name
-        notes.append(
-            f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {victim}"
-        )
-    times = raw.times_s if raw else np.array(recording.numbers) if recording.numbers else None  # numbers in any step
-    times = np.arange(count) if times is None else times
-    frames = frames_at(recording, luma, times[: count if part else len(luma)], first + np.arange(len(luma)))
-    return replace(frames, damaged=damaged, notes=(*notes, *frames.notes))
-
-
-def pictures_of(recording: Recording) -> Iterator[tuple[NDArray[Any], bool]]:
-    """Each picture, and whether it is whole. One that cannot be read is black; a stack ends before it."""
-    if recording.raw is not None or recording.kind == "stack":
-        pages = recording.raw.pictures() if recording.raw is not None else _stack_pages(recording)
-        yield from ((page, True) for page in pages)
+    if (raw := recording.raw) is not None:
+        first, last = part or (0, len(raw.offsets) - 1)
+        pictures = replace(raw, offsets=raw.offsets[first : last + 1]).pictures()
+        yield from zip(pictures, map(Shot, raw.times[first:].tolist()), strict=False)
+        return
+    if recording.kind == "stack":
+        yield from zip(_stack_pages(recording), map(Shot, itertools.count()), strict=False)
         return
     shape, dtype = (recording.height, recording.width), np.uint8 if recording.bit_depth <= 8 else np.uint16
     # Decoders silently fill a missing part with grey: a JPEG or PNG must have its end marker.
     markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
-    for file in recording.files:
-        picture = _read_or_none(file)
+    for file, number in zip(recording.files, recording.numbers or itertools.count(), strict=False):  # in any step
+        picture, is_whole = _read_or_none(file), False
         if picture is None or picture.shape != shape:
-            yield np.zeros(shape, dtype), False
-            continue
-        with file.open("rb") as stream:
-            stream.seek(max(file.stat().st_size - 64, 0))
-            yield picture, markers.get(file.suffix.lower(), b"") in stream.read()
+            picture = np.zeros(shape, dtype)
+        else:
+            with file.open("rb") as stream:
+                stream.seek(max(file.stat().st_size - 64, 0))
+                is_whole = markers.get(file.suffix.lower(), b"") in stream.read()
+        if not is_whole:
+            said.append((0, "", f"{file.name} is cut short or cannot be read"))
+        yield picture, Shot(number, not is_whole)
 
 
 def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tuple[str, ...]]:

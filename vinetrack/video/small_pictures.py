@@ -20,8 +20,7 @@ from vinetrack.video.frames import (
     Frames,
     PacketIndex,
     Recording,
-    film_frames,
-    luma_plane,
+    film_shots,
     packet_index,
     quiet_log,
     read_frames,
@@ -268,13 +267,12 @@ def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDAr
     # Key frames so close to each other that no event fits between two of them
     keys_only = len(keys) > 1 and np.diff(keys, append=count).max() <= MAX_SAMPLE_INTERVAL
     candidates = keys if keys_only else np.arange(count)
-    chosen = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
+    chosen: dict[float, int] = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
     sampled = {}
     with quiet_log() as said:
-        for frame, _ in film_frames(recording.path, said, chosen=chosen if keys_only else None):
-            number = None if frame.pts is None else chosen.get(frame.pts)
-            if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-                sampled[number] = _shrunk(luma_plane(frame), recording)
+        for picture, shot in film_shots(recording, said, chosen=chosen if keys_only else None):
+            if (number := chosen.get(shot.tick)) is not None:
+                sampled[number] = _shrunk(picture, recording)
     numbers = sorted(sampled)
     return [sampled[number] for number in numbers], np.array(numbers, dtype=int)
 
