@@ -9,8 +9,6 @@ point is fixed on the body.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +16,7 @@ from vinetrack.core.records import Bools, Floats
 from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
-from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip
+from vinetrack.video.strip import SLOW_PX, Look, Positions, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
 
@@ -26,21 +24,12 @@ SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate i
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
 
 
-class BodyTracker:
-    """Follows a body, which moves as a whole."""
-
-    def follow(self, look: Look) -> Positions | None:
-        """Register the body of a strip against itself; None where the travel ratio says that a tube everts."""
-        if look.travel_ratio != 1:
-            return None
-        strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
-        return replace(track_body(strip), exposure_frames=look.exposure_frames)
-
-
-def track_body(strip: Strip) -> Positions:
-    """Register the moving body of a strip against itself."""
-    pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
-    pictures += strip.offset[:, None, None].astype(np.float32)
+def follow_body(look: Look) -> Positions | None:
+    """Register what moves along an axis against itself; None where the travel ratio says that a tube everts."""
+    if look.travel_ratio != 1:
+        return None
+    strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
+    pictures = strip.brightness()
     path, half = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
     if np.isfinite(strip.axis.width_px):
         # A body is about as long as it is wide; a glint on it is shorter.
@@ -85,6 +74,7 @@ def track_body(strip: Strip) -> Positions:
     return Positions(
         strip=strip, edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error,
         unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
+        exposure_frames=look.exposure_frames,
     )  # fmt: skip
 
 

@@ -386,10 +386,13 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
 
 
-def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions:
-    """Track the leading edge of a tube through its strip, growing towards higher columns."""
+def follow_edge(look: Look) -> Positions | None:
+    """Follow the leading edge of a tube through a strip centred on it; None where no tube grows along the axis."""
+    if (outlined := tube_strip(look.luma, look.axis, look.small)) is None:
+        return None
+    strip, tube = outlined
     rounds = 4  # Fewest rounds of the alternation (chosen)
-    path, passed = tube.path_px, tube.passed
+    path, passed, exposure_frames = tube.path_px, tube.passed, look.exposure_frames
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
     for iteration in range(3):
@@ -420,24 +423,11 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
             break
     resting_fit = fit_edges(strip, state, ~informative)
     fit = repair_jumps(strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool))
-    finished = _with_errors(strip, state, fit, exposure, passed)
+    finished = _with_errors(strip, state, fit, exposure, tube)
     if not np.isfinite(exposure_frames):
         return finished
     blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
-
-
-class EdgeTracker:
-    """Follows the leading edge of a tube."""
-
-    def follow(self, look: Look) -> Positions | None:
-        """Follow the edge through a strip centred on the tube; None where no tube grows along the axis."""
-        if (outlined := tube_strip(look.luma, look.axis, look.small)) is None:
-            return None
-        strip, tube = outlined
-        return replace(
-            track_edge(strip, look.exposure_frames, tube), width_px=tube.width_px, width_sigma_px=tube.width_sigma_px
-        )
 
 
 @dataclass(frozen=True)
@@ -589,7 +579,7 @@ def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: fl
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
-def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
+def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
     """Add to a converged fit the errors of bands, start and doors, and refer the edge to mid-exposure."""
     from scipy.ndimage import median_filter
 
@@ -603,8 +593,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     acceleration = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(acceleration, -50, 50) * exposure**2 / 24
     contrast = (state.appearance[0] - state.appearance[1]).mean(axis=0).astype(float)
-    contrast[: passed[0]] = np.nan
-    contrast[passed[1] :] = np.nan
+    contrast[: tube.passed[0]] = contrast[tube.passed[1] :] = np.nan
     # 25.0: growth over which that error falls to 1/e (chosen)
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
     near = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
@@ -653,5 +642,5 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     return Positions(
         strip=strip, edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden),
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
-        bands_sigma_px=bands,
+        bands_sigma_px=bands, width_px=tube.width_px, width_sigma_px=tube.width_sigma_px,
     )  # fmt: skip

@@ -24,35 +24,16 @@ from vinetrack.core.threads import njit
 # and the process that compiles them would run another one than those that load them.
 
 TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
-Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)
 MIN_MOTION_BLUR_PX = 0.02  # Shorter motion blurs are set to this length (derived)
 SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)  # Entries of the coverage table per pixel (derived)
-_NORMAL = np.array(
-    [
-        [0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)]
-        for z in np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
-    ]
-)
 FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _normal(z: float) -> tuple[float, float]:
-    """Interpolate Φ(z) and its integral zΦ(z) + φ(z) from the table."""
-    if z <= -Z_LAST:
-        return 0.0, 0.0
-    if z >= Z_LAST:
-        return 1.0, z
-    at = (z + Z_LAST) / Z_STEP
-    i = int(at)
-    f = at - i
-    low, high = _NORMAL[i, 0], _NORMAL[i + 1, 0]
-    low_slope, high_slope = _NORMAL[i, 1], _NORMAL[i + 1, 1]
-    z_low, z_high = i * Z_STEP - Z_LAST, (i + 1) * Z_STEP - Z_LAST
-    low_sum, high_sum = z_low * low + low_slope, z_high * high + high_slope
-    g = 1 - f
-    a, b, c, d = (1 + 2 * f) * g * g, f * g * g * Z_STEP, f * f * (3 - 2 * f), f * f * g * Z_STEP
-    return a * low + b * low_slope + c * high - d * high_slope, a * low_sum + b * low + c * high_sum - d * high
+    """The normal distribution function Φ(z), and its integral zΦ(z) + φ(z)."""
+    below = 0.5 * math.erfc(-z / math.sqrt(2))
+    return below, z * below + math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
 
 
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")

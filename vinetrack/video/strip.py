@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,13 +89,6 @@ class Look:
     small: SmallPictures
     travel_ratio: float
     exposure_frames: float
-
-
-class Tracker(Protocol):
-    """One way to follow what moves along an axis."""
-
-    def follow(self, look: Look) -> Positions | None:
-        """Follow it; None where it is not what this tracker knows."""
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
