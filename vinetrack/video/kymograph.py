@@ -10,36 +10,6 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
 
-
-@njit(nogil=True)
-def monotone_path_sums(
-    along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
-) -> np.ndarray:
-    """Return the maximum change that a monotone path collects, for each band of two bins across parallel lines. Shapes:
-    along, across, time, weight (n_pixels,) → (bins − 1,).
-    """
-    places = length // 4 + 1
-    table = np.zeros((bins, n_times, places), np.float32)
-    low, high = np.full((bins, n_times), places), np.full((bins, n_times), -1)
-    for i in range(len(along)):
-        b, t, s = min(max(int(across[i]), 0), bins - 1), int(time[i]), min(max(int(along[i] / 4), 0), places - 1)
-        table[b, t, s] += weight[i]
-        low[b, t], high[b, t] = min(low[b, t], s), max(high[b, t], s)
-    out = np.zeros(bins - 1)
-    best = np.zeros(places + 1)
-    for b in range(bins - 1):
-        best[:] = 0.0
-        for t in range(n_times):
-            last = max(high[b, t], high[b + 1, t]) + 1
-            # `best` never decreases along the line: it changes only from where a pixel changes now onwards.
-            for s in range(min(low[b, t], low[b + 1, t]) + 1, places + 1):
-                if s > last and best[s] >= best[s - 1]:
-                    break
-                best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
-        out[b] = best[-1]
-    return out
-
-
 # Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)
 END_FRAMES = 5
 
