@@ -13,7 +13,7 @@ from vinetrack.core.records import Trial
 from vinetrack.video import curved_axis as curves
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import PlaneCalibration, PlaneMap
-from vinetrack.video.curved_axis import axis_through, curve_problem
+from vinetrack.video.curved_axis import axis_problem, axis_through
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import cut_strip
@@ -66,10 +66,10 @@ def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused():
     with pytest.raises(RecordingError):
         axis_through([(10.0, 10.0), (10.5, 10.0), (90.0, 40.0)])
     sharp = axis_through([(20.0, 20.0), (60.0, 20.0), (60.0, 50.0)])
-    assert curve_problem(sharp, 40.0, (100, 100)) is not None
-    assert curve_problem(sharp, math.nan, (100, 100)) is None
-    assert curve_problem(Axis((0.0, 0.0), (500.0, 0.0)), 10.0, (100, 100)) is None
-    assert curve_problem(quarter(), 5.0, (310, 400)) is not None
+    assert axis_problem(sharp, 40.0, (100, 100)) is not None
+    assert axis_problem(sharp, math.nan, (100, 100)) is None
+    assert axis_problem(Axis((0.0, 0.0), (500.0, 0.0)), 10.0, (100, 100)) is not None
+    assert axis_problem(quarter(), 5.0, (310, 400)) is not None
 
 
 def test_rings_about_the_circles_middle_become_level_lines():

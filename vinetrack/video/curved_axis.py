@@ -41,12 +41,10 @@ def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
     return axis_through(through, float("nan") if width is None else float(width))
 
 
-def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
-    """Say why a curve cannot be used in a picture, and the remedy; None where it can, or where it is a straight line.
-    Returns the end of a sentence that begins with "the axis", and the remedy; or None.
+def axis_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
+    """Say why an axis cannot be used in a picture, and the remedy; None where it can. Returns the end of a sentence
+    that begins with "the axis", and the remedy; or None.
     """
-    if not axis.bends:
-        return None
     places = axis.points(np.linspace(0.0, axis.length_px, int(axis.length_px) + 2))
     if (places < -0.5).any() or (places > np.array(size_px) - 0.5).any():
         return f"leaves the picture, {size_px[0]} × {size_px[1]} pixels", "give points inside it"
@@ -128,6 +126,6 @@ def find_curve(small: SmallPictures) -> Axis | None:
         axis = axis_through(through, axis.width_px)
     except RecordingError:
         return None
-    if not axis.bends or curve_problem(axis, axis.width_px / 2, size):
+    if not axis.bends or axis_problem(axis, axis.width_px / 2, size):
         return None
     return axis

@@ -44,6 +44,19 @@ class Pixels(NamedTuple):
         return Pixels(self.x[kept], self.y[kept], self.time[kept], self.weight[kept], self.n_times)
 
 
+def _shrinkage(picture: NDArray[Any]) -> float:
+    """Factor by which a picture is shrunk to at most 240 px (chosen)."""
+    return max(1.0, max(picture.shape) / 240)
+
+
+def _shrunk(picture: NDArray[Any]) -> NDArray[Any]:
+    """The picture, shrunk."""
+    import cv2
+
+    width, height = (max(8, round(side / _shrinkage(picture))) for side in picture.shape[::-1])
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+
+
 class SmallPictures:
     """The frames of a recording, shrunk once for every step that looks for its axis. `frames`, shape (n_frames, height,
     width), are in grey levels of 255, corrected for flicker; `factor` is the factor by which they were shrunk and
@@ -51,14 +64,10 @@ class SmallPictures:
     """
 
     def __init__(self, luma: NDArray[Any]) -> None:
-        import cv2
-
-        n, height, width = luma.shape
-        self.shape, self.factor = (height, width), max(1.0, max(height, width) / 240)  # at most 240 px (chosen)
-        size = (max(8, round(width / self.factor)), max(8, round(height / self.factor)))
-        small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
+        self.shape, self.factor = luma.shape[1:], _shrinkage(luma[0])
+        small = np.stack([_shrunk(frame) for frame in luma]).astype(np.float32)
         sampled = small[:, ::4, ::4] + np.float32(1.0)
-        gain = np.median(sampled / sampled[n // 2], axis=(1, 2))
+        gain = np.median(sampled / sampled[len(luma) // 2], axis=(1, 2))
         small /= np.clip(gain, 0.2, 5.0)[:, None, None]
         self.frames = small * np.float32(255.0 / max(float(small.max()), 1.0))
 
@@ -151,40 +160,28 @@ def _contrast_gain(frames: NDArray[np.float32], rows: Indices, columns: Indices,
     ends = [np.median(frames[:count], axis=0), np.median(frames[-count:], axis=0)]
     still = np.ones(frames.shape[1:], np.float32)
     still[rows, columns] = 0.0
-    grounds = [_side_sums(picture * still) for picture in (*ends, np.ones_like(still))]
     out = np.zeros(len(rows))
-    for first, last, weight in zip(*grounds, strict=True):
-        total_weight = np.maximum(weight, 1e-9)
+    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # sides of a pixel
+        first, last, weight = (_side_sum(picture * still, down, across) for picture in (*ends, np.ones_like(still)))
         before, after = (
-            cv2.blur((picture - ground / total_weight) ** 2, (3, 3))[rows, columns]
+            cv2.blur((picture - ground / np.maximum(weight, 1e-9)) ** 2, (3, 3))[rows, columns]
             for picture, ground in zip(ends, (first, last), strict=True)
         )
-        out = np.maximum(
-            out, np.where(total_weight[rows, columns] > 1e-6, after / (before + after + 2 * noise_power), 0.0)
-        )
+        seen = weight[rows, columns] > 1e-6
+        out = np.maximum(out, np.where(seen, after / (before + after + 2 * noise_power), 0.0))
     return out
 
 
-def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """Sum the pixels left, right, above and below of each pixel; distant ones count where none is near."""
+def _side_sum(picture: NDArray[np.float32], down: int, across: int) -> NDArray[np.float32]:
+    """Mean of the pixels on one side of each pixel; distant ones count where none is near."""
     import cv2
 
-    # Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel (chosen)
-    surroundings_px = 4.0
-    out = [np.zeros_like(picture) for _ in range(4)]
-    for share, reach in ((1.0, 1), (1e-2, 4), (1e-4, 16)):
-        # Wider filters are applied to a picture shrunk by the same factor.
-        height, width = picture.shape
-        shrunk = cv2.resize(picture, (-(-width // reach), -(-height // reach)), interpolation=cv2.INTER_AREA)
-        size = 2 * min(round(3 * surroundings_px), max(shrunk.shape)) + 1
-        kernel = cv2.getGaussianKernel(size, surroundings_px, cv2.CV_32F).ravel()
-        back, ahead = kernel.copy(), kernel.copy()
-        back[size // 2 + 1 :] = ahead[: size // 2] = 0.0
-        for side, (along, across) in zip(
-            out, ((back, kernel), (ahead, kernel), (kernel, back), (kernel, ahead)), strict=True
-        ):
-            filtered = cv2.sepFilter2D(shrunk, -1, along, across, borderType=cv2.BORDER_CONSTANT)
-            side += share * (filtered if reach == 1 else cv2.resize(filtered, (width, height)))
+    out = np.zeros_like(picture)
+    # 6, 24, 96: distances, in the small pictures, over which unchanged pixels are the surroundings of a pixel (chosen)
+    for share, reach in ((1.0, 6), (1e-2, 24), (1e-4, 96)):
+        size = (reach + 1 if across else 2 * reach + 1), (reach + 1 if down else 2 * reach + 1)
+        anchor = (reach if across <= 0 else 0), (reach if down <= 0 else 0)
+        out += share * cv2.boxFilter(picture, -1, size, anchor=anchor, borderType=cv2.BORDER_CONSTANT)
     return out
 
 
@@ -225,7 +222,7 @@ def read_event(recording: Recording, frame_range: tuple[int, int] | None = None)
     return read_frames(recording, (frame_range[0], min(frame_range[1], count - 1)), index)
 
 
-def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int) -> tuple[int, int] | None:
+def event_range(pictures: list[NDArray[Any]], numbers: Indices, count: int) -> tuple[int, int] | None:
     """Return the first and last frame of the event, both and a margin included, from samples of the recording; None if
     nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
     """
@@ -233,25 +230,19 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int)
         return None
     import cv2
 
-    reference = pictures[len(pictures) // 2][::2, ::2].astype(np.float32) + 1.0
-
-    def level(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        # After blurring, values are no longer integers, so that medians resolve noise below one grey level.
-        blurred = cv2.blur(picture.astype(np.float32), (3, 3))
-        gain = np.clip(np.median((blurred[::2, ::2] + 1.0) / reference), 0.2, 5.0)
-        return np.asarray(blurred / np.float32(gain), dtype=np.float32)
-
+    # After blurring, values are no longer integers, so that medians resolve noise below one grey level.
+    blurred = np.stack([cv2.blur(picture.astype(np.float32), (3, 3)) for picture in pictures])
+    frames = SmallPictures(blurred).frames
     # 40: pairs of samples from which the noise is estimated (chosen)
-    pairs = np.linspace(0, len(pictures) - 2, min(40, len(pictures) - 1)).astype(int)
-    steps = [np.abs(level(pictures[i + 1]) - level(pictures[i])) for i in pairs]
-    noise = 1.4826 / np.sqrt(2) * np.median(steps, axis=0)
+    pairs = np.linspace(0, len(frames) - 2, min(40, len(frames) - 1)).astype(int)
+    noise = 1.4826 / np.sqrt(2) * np.median(np.abs(frames[pairs + 1] - frames[pairs]), axis=0)
     # The median of three samples at either end shows the scene at rest.
-    first, last = (np.median([level(picture) for picture in end], axis=0) for end in (pictures[:3], pictures[-3:]))
-    # 6.0, 3.0: change of a pixel that counts, in units of its noise (measured), and at least, grey levels (chosen)
-    limit = np.maximum(6.0 * np.maximum(noise, np.median(noise)), 3.0)
+    first, last = (np.median(end, axis=0) for end in (frames[:3], frames[-3:]))
+    # 6.0, 4.5: change of a pixel that counts, in units of its noise (measured), and at least, grey levels (chosen)
+    limit = np.maximum(6.0 * np.maximum(noise, np.median(noise)), 4.5)
 
     def differ(still: NDArray[np.float32]) -> Indices:
-        counts = [np.count_nonzero(np.abs(level(picture) - still) > limit) for picture in pictures]
+        counts = [np.count_nonzero(np.abs(frame - still) > limit) for frame in frames]
         return np.flatnonzero(np.array(counts) >= 8)  # pixels that must have changed (chosen)
 
     differs_from_first, differs_from_last = differ(first), differ(last)
@@ -263,11 +254,11 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int)
     return max(start - margin, 0), min(stop + margin, count - 1)
 
 
-def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDArray[np.uint8]], Indices]:
+def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDArray[Any]], Indices]:
     """Every n-th frame, shrunk, and their numbers; of a film the key frames, unless these are too rare."""
     if (raw := recording.raw) is not None:
         every = -(-len(raw.offsets) // MAX_SAMPLES)
-        pictures = [_shrunk(picture, recording) for picture in replace(raw, offsets=raw.offsets[::every]).pictures()]
+        pictures = [_shrunk(picture) for picture in replace(raw, offsets=raw.offsets[::every]).pictures()]
         return pictures, every * np.arange(len(pictures))
     assert index is not None
     count, keys = len(index.ticks), np.flatnonzero(index.key)
@@ -275,21 +266,7 @@ def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDAr
     keys_only = len(keys) > 1 and np.diff(keys, append=count).max() <= MAX_SAMPLE_INTERVAL
     candidates = keys if keys_only else np.arange(count)
     chosen: dict[float, int] = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
-    sampled = {}
     with quiet_log() as said:
-        for picture, shot in film_shots(recording, said, chosen=chosen if keys_only else None):
-            if (number := chosen.get(shot.tick)) is not None:
-                sampled[number] = _shrunk(picture, recording)
-    numbers = sorted(sampled)
-    return [sampled[number] for number in numbers], np.array(numbers, dtype=int)
-
-
-def _shrunk(picture: NDArray[Any], recording: Recording) -> NDArray[np.uint8]:
-    """Shrink a picture to at most 320 px (chosen), grey levels of 255."""
-    import cv2
-
-    factor = max(1.0, max(picture.shape) / 320)
-    size = (max(8, round(recording.width / factor)), max(8, round(recording.height / factor)))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    scale = 1.0 if picture.dtype == np.uint8 else 255.0 / (2**recording.bit_depth - 1)
-    return np.asarray(cv2.convertScaleAbs(small, alpha=scale), np.uint8)
+        shots = film_shots(recording, said, chosen=chosen if keys_only else None)
+        sampled = {chosen[shot.tick]: _shrunk(picture) for picture, shot in shots if shot.tick in chosen}
+    return list(sampled.values()), np.array(list(sampled), dtype=int)

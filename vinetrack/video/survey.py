@@ -11,7 +11,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, PictureAxis, Trial
+from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
-from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
+from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.curved_axis import axis_entry, curve_problem, find_growth_axis
+from vinetrack.video.curved_axis import axis_entry, axis_problem, find_growth_axis
 from vinetrack.video.edge import tube_strip
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
@@ -118,14 +118,8 @@ def _seen(target: Calibration, folder: Path, width_px: int, height_px: int, _sta
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
     """Return the growth axis of the sheet, else of the settings."""
-    if trial.axis is not None:
-        axis = trial.axis
-        return axis_through((axis.from_px, *axis.via_px, axis.to_px), axis.width_m / m_per_px)
-    if settings.axis is None:
-        return None
-    shared = settings.axis
-    width_px = shared.width_mm / 1e3 / m_per_px if shared.width_mm is not None else math.nan
-    return axis_through((shared.from_px, *(shared.via_px or ()), shared.to_px), width_px)
+    drawn = trial.axis or (settings.axis and settings.axis.in_picture)
+    return drawn and axis_through((drawn.from_px, *drawn.via_px, drawn.to_px), drawn.width_m / m_per_px)
 
 
 def proposed_axis(luma: NDArray[Any]) -> Axis:
@@ -239,29 +233,29 @@ class RecordingFacts:
         return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
 
 
-def _facts(
-    trial: Trial, recording: Recording, m_per_px: float, scale_rel_sigma: float, capture_fps: float,
-    n_frames: int | None, axis: Axis | None,
-) -> RecordingFacts:  # fmt: skip
-    """Facts of one recording that its header and the sheet state."""
-    return RecordingFacts(
-        trial=trial.name, n_frames=n_frames, capture_fps=capture_fps, playback_fps=recording.playback_fps, axis=axis,
-        mm_per_px=1e3 * m_per_px, scale_rel_sigma=scale_rel_sigma, picture_mm=1e3 * m_per_px * recording.width,
-    )  # fmt: skip
-
-
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
     """Facts of a recording that was tracked."""
     tracking, mm_per_px = measurement.tracking, 1e3 * measurement.m_per_px
     position_m = tracking.track.lead_position_m[tracking.track.usable]
-    stated = measurement.recording, measurement.m_per_px, measurement.scale_rel_sigma, measurement.capture_fps
     return replace(
-        _facts(trial, *stated, len(tracking.track.time_s), tracking.axis),
+        _stated_facts(trial, measurement.recording, measurement.m_per_px, measurement.scale_rel_sigma, tracking.axis),
+        n_frames=len(tracking.track.time_s),
         tube_width_mm=mm_per_px * tracking.tube_width_px,
         tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
         growth_mm=1e3 * float(np.max(position_m) - position_m[0]) if position_m.size else math.nan,
         mean_speed_m_s=mean_speed(tracking.track),
     )
+
+
+def _stated_facts(
+    trial: Trial, recording: Recording, m_per_px: float, scale_rel_sigma: float, axis: Axis | None
+) -> RecordingFacts:
+    """Facts of one recording that its header and the sheet state."""
+    return RecordingFacts(
+        trial=trial.name, n_frames=_frames_present(recording), capture_fps=capture_rate(trial, recording),
+        playback_fps=recording.playback_fps, mm_per_px=1e3 * m_per_px, scale_rel_sigma=scale_rel_sigma,
+        picture_mm=1e3 * m_per_px * recording.width, axis=axis,
+    )  # fmt: skip
 
 
 def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
@@ -390,8 +384,12 @@ class Surveyor:
         of_scale, calibrations = _scale_problems(experiment.settings, experiment.folder, opened)
         self.looked_into = _one_per_condition(sound)
         for trial in progress(sound, "looking into recordings"):
+            of_trial, m_per_px, rel_sigma = [], trial.m_per_px, math.nan
             scale = calibrations.get((opened[trial].width, opened[trial].height))
-            facts, of_trial = _stated_facts(trial, experiment.settings, opened[trial], scale), []
+            if not math.isfinite(m_per_px) and scale is not None:
+                m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
+            axis = given_axis(trial, experiment.settings, m_per_px)
+            facts = _stated_facts(trial, opened[trial], m_per_px, rel_sigma, axis)
             if trial in self.looked_into:
                 with contextlib.suppress(RecordingError):
                     measurement = measure_recording(trial, experiment.settings, experiment.folder, self.keep)
@@ -403,29 +401,12 @@ class Surveyor:
 
 
 def _one_per_condition(trials: list[Trial]) -> list[Trial]:
-    """The recordings to look into: all of a few, else one of each condition, or of each vine where those are many."""
+    """The recordings to look into: all of a few, else one of each vine, and of each condition while they are few."""
     most_looks = 12  # Most recordings that are tracked, a second or two each (chosen)
     if len(trials) <= most_looks:
         return trials
-    conditions = list({(trial.condition, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
-    if len(conditions) <= most_looks:
-        return conditions
-    vines = list({(trial.vine, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
-    others = [trial for trial in conditions if trial not in vines]
-    return [*vines, *others][:most_looks]
-
-
-def _stated_facts(
-    trial: Trial, settings: ExperimentSettings, recording: Recording, scale: PlaneCalibration | None
-) -> RecordingFacts:
-    """Facts of one recording that its header and the sheet state."""
-    m_per_px, rel_sigma = trial.m_per_px, math.nan
-    if not math.isfinite(m_per_px) and scale is not None:
-        m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
-    count = _frames_present(recording)
-    count = recording.declared_frames if count is None else count
-    axis = given_axis(trial, settings, m_per_px)
-    return _facts(trial, recording, m_per_px, rel_sigma, capture_rate(trial, recording), count, axis)
+    kinds = [{(getattr(t, kind), t.m_per_px): t for t in reversed(trials)} for kind in ("vine", "condition")]
+    return list(dict.fromkeys(trial for firsts in kinds for trial in reversed(firsts.values())))[:most_looks]
 
 
 def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
@@ -441,10 +422,9 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
         for note in recording.notes
     ]
     declared, present = recording.declared_frames, _frames_present(recording)
-    count = declared if present is None else present
-    if count is not None and count < FEWEST_FRAMES:
+    if present is not None and present < FEWEST_FRAMES:
         remedy = f"at least {FEWEST_FRAMES} are needed"
-        return [*problems, Problem(message=f"has {count} frames", remedy=remedy, **place)]
+        return [*problems, Problem(message=f"has {present} frames", remedy=remedy, **place)]
     if declared is not None and present is not None and present < declared:
         message = f"is cut short: {present} of the {declared} frames that it declares are there"
         remedy = "copy it from the camera again"
@@ -453,7 +433,7 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
 
 
 def _frames_present(recording: Recording) -> int | None:
-    """Number of frames in the file, if it can be known without decoding; None otherwise."""
+    """Number of frames in the file, if it can be known without decoding; else as many as it declares."""
     if recording.raw is not None:
         size, raw = recording.path.stat().st_size, recording.raw
         return sum(offset + raw.frame_bytes <= size for offset in raw.offsets)
@@ -471,7 +451,7 @@ def _frames_present(recording: Recording) -> int | None:
         # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
         if size <= 64_000_000:
             return sum(1 for packet in container.demux(stream) if packet.size)
-    return None
+    return recording.declared_frames
 
 
 def _scale_problems(
@@ -498,30 +478,15 @@ def _scale_problems(
             problems += [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
         except CalibrationError as error:  # only the first is reported
             problems.append(Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place))
-    of_all: list[Problem] = []  # of the axis that all share, in the first picture that it does not fit
+    of_all = False  # whether the axis that all share was named, for the first picture that it does not fit
     for trial, recording in opened.items():
-        if trial.axis is not None:
-            problems += _axis_problems(trial, trial.axis, recording, {"trial": trial.name}, calibrations)
-        elif settings.axis is not None:
-            of_all = of_all or _axis_problems(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
-    return problems + of_all, calibrations
-
-
-def _axis_problems(
-    trial: Trial, given: AxisSettings | PictureAxis, recording: Recording, place: dict[str, Any],
-    calibrations: Mapping[tuple[int, int], PlaneCalibration],
-) -> list[Problem]:  # fmt: skip
-    """Problems of a given axis in the picture of one recording, reported at its place in the files."""
-    through = (given.from_px, *(given.via_px or ()), given.to_px)
-    if not all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in through):
-        message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
-        remedy = f"give {'points' if given.via_px else 'two points'} inside it"
-        return [Problem(message=message, column="axis", remedy=remedy, **place)]
-    if not given.via_px:
-        return []
-    scale = calibrations.get((recording.width, recording.height))
-    m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
-    width_mm = given.width_mm if isinstance(given, AxisSettings) else 1e3 * given.width_m
-    width_m = trial.diameter_m if width_mm is None or math.isnan(width_mm) else width_mm / 1e3
-    complaint = curve_problem(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
-    return [] if complaint is None else [Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)]
+        scale = calibrations.get((recording.width, recording.height))
+        m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
+        axis = given_axis(trial, settings, m_per_px)
+        half_px = trial.diameter_m / m_per_px / 2 if axis is None or math.isnan(axis.width_px) else axis.width_px / 2
+        if axis and (complaint := axis_problem(axis, half_px, (recording.width, recording.height))):
+            place = {"file": SETTINGS} if trial.axis is None else {"trial": trial.name}
+            problem = Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)
+            problems += [] if trial.axis is None and of_all else [problem]
+            of_all = of_all or trial.axis is None
+    return problems, calibrations

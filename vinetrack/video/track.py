@@ -15,7 +15,7 @@ from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis
 from vinetrack.video.body import follow_body
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.curved_axis import curve_problem, find_growth_axis
+from vinetrack.video.curved_axis import axis_problem, find_growth_axis
 from vinetrack.video.edge import follow_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
@@ -290,7 +290,7 @@ def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, tri
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
         size_px = luma.shape[2], luma.shape[1]
-        if complaint := curve_problem(axis, width_px / 2 if width_known else math.nan, size_px):
+        if complaint := axis_problem(axis, width_px / 2 if width_known else math.nan, size_px):
             raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
         wide_px = min(wide_px, 2 * axis.largest_half_px)
         return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
