@@ -33,7 +33,6 @@ from vinetrack.video.edge_state import (
     clear_of_start,
     core_frames,
     estimate_appearance,
-    find_exposure,
     find_shading,
     find_shape,
     fit_edges,
@@ -412,7 +411,7 @@ def follow_edge(look: Look) -> Positions | None:
         state = estimate_appearance(strip, state, 4 * strip.noise + 4)
         informative = informative_frames(state.edge)
         if iteration == 1 and not np.isfinite(exposure_frames):
-            exposure = find_exposure(strip, state, fit)
+            exposure = np.nan_to_num(seen_exposure(strip, state, fit, exposure_frames)[0], nan=ASSUMED_EXPOSURE)
         state = find_shape(strip, state, fit)
         if iteration > 0:
             state = find_shading(strip, state, fit)

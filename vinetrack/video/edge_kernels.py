@@ -335,22 +335,17 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def residual_sums(
+def residuals(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Sums over the pixels about the edge, with r the residual and w its weight, each frame by itself. Shapes: fit
-    (n_frames, 6); frames (n_used,).
-
-    By row: Σ w g r and Σ w g², g the derivative of the model with respect to the row's lag, shape (n_used, n_across,
-    2). By distance from the row's own edge, in the bins of `shading`: Σ w r and Σ w, shape (n_used, 2, n_distances). In
-    all: log(1 + r²/9v), v the mean of the variances of film and background, and the number of pixels, shape (n_used,
-    2): a robust misfit for comparing blurs, since v does not depend on the blur; otherwise a wider one would lower its
-    own misfit.
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Pixels about the edge, by distance ahead of the whole column of their row's own edge, in the bins of `shading`:
+    residual r, weight (0 where there is no pixel), derivative of the model with respect to the row's lag, and log(1 +
+    r²/9v), with v the mean of the variances of film and background, shape (4, n_used, n_across, n_distances). And the
+    part of a column by which the edge lies further, (n_used, n_across). Shapes: fit (n_frames, 6); frames (n_used,).
     """
     _, rows, columns = strip.shape
-    by_row, by_place = np.zeros((len(frames), rows, 2)), np.zeros((len(frames), 2, len(shading)))
-    misfit, residuals, weights = np.zeros((len(frames), 2)), np.empty(columns), np.empty(columns)
+    out, fractions = np.zeros((4, len(frames), rows, len(shading)), np.float32), np.zeros((len(frames), rows))
     for used in range(len(frames)):
         t = frames[used]
         y, length, gain, level = fit[t, 0], lengths[t], 1 + fit[t, 3], fit[t, 4]
@@ -361,43 +356,19 @@ def residual_sums(
             row_edge = y - lag[u]
             whole_px, j, f = subpixel_index(row_edge)
             a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
-            if b <= a:
-                continue
-            k, m, fraction = a - whole_px + middle, b - a, row_edge - whole_px
-            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
-            low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-            values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
-            film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
-            first_bin = a - whole_px + (len(shading) - 1) // 2
-            shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
-            residual, weight = residuals[:m], weights[:m]
-            for i in range(m):
-                p = low[i] + f * (high[i] - low[i])
-                r = values[i] * scale[t] + offset[t] - background[i] - (film[i] - background[i]) * (gain * p + level)
-                residual[i] = r - shade_after[i] - fraction * (shade_before[i] - shade_after[i])
-            for i in range(m):
-                p = low[i] + f * (high[i] - low[i])
-                v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
-                weight[i] = 1 / (v + residual[i] * residual[i] / 9)
-            gradient, curvature = 0.0, 0.0
-            for i in range(m):
-                g = (background[i] - film[i]) * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
-                gradient += weight[i] * g * residual[i]
-                curvature += weight[i] * g * g
-            by_row[used, u, 0], by_row[used, u, 1] = gradient, curvature
-            for start in range(0, m, 32):  # the logarithm of a product: 32 factors, at most 1e9 each, do not overflow
-                product = 1.0
-                for i in range(start, min(start + 32, m)):
-                    square = residual[i] * residual[i]
-                    product *= min(1 + square / (4.5 * (film_variance[i] + background_variance[i])), 1e9)
-                misfit[used, 0] += math.log(product)
-            misfit[used, 1] += m
-            # The row's edge lies between two whole columns: each pixel counts in two bins.
-            for further in range(2):
-                part, d = (fraction if further else 1 - fraction), k - middle + (len(shading) - 1) // 2 - further
-                weighted_of, weight_of = by_place[used, 0, d : d + m], by_place[used, 1, d : d + m]
-                for i in range(m):
-                    weighted_of[i] += part * weight[i] * residual[i]
-                for i in range(m):
-                    weight_of[i] += part * weight[i]
-    return by_row, by_place, misfit
+            fraction = row_edge - whole_px
+            fractions[used, u] = fraction
+            for s in range(a, b):
+                k, d = s - whole_px + middle, s - whole_px + (len(shading) - 1) // 2
+                p = table[0, j, k] + f * (table[0, j + 1, k] - table[0, j, k])
+                slope = table[1, j, k] + f * (table[1, j + 1, k] - table[1, j, k])
+                film, background = appearance[0, u, s], appearance[1, u, s]
+                film_variance, background_variance = appearance[2, u, s], appearance[3, u, s]
+                shade = shading[d] + fraction * (shading[d - 1] - shading[d])
+                modelled = background + (film - background) * (gain * p + level) + shade
+                r = strip[t, u, s] * scale[t] + offset[t] - modelled
+                out[0, used, u, d] = r
+                out[1, used, u, d] = 1 / (p * p * film_variance + (1 - p) * (1 - p) * background_variance + r * r / 9)
+                out[2, used, u, d] = (background - film) * slope
+                out[3, used, u, d] = math.log1p(r * r / (4.5 * (film_variance + background_variance)))
+    return out, fractions

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,31 +171,26 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
     return padded
 
 
-class Residuals(NamedTuple):
-    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances)
-    and (2,).
+def residuals(
+    strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX
+) -> tuple[NDArray[np.float32], Floats]:
+    """What a fit leaves in the frames of `use`; see `edge_kernels.residuals`. Shapes: fit (n_frames, 6); use
+    (n_frames,).
     """
-
-    by_row: Floats
-    by_place: Floats
-    misfit: Floats
-
-
-def residuals(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> Residuals:
-    """Sum what a fit leaves over the frames of `use`. Shapes: fit (n_frames, 6); use (n_frames,)."""
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
-    sums = kernels.residual_sums(
+    return kernels.residuals(
         strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
         margin_px, frames, shading,
     )  # fmt: skip
-    return Residuals(*(of_frames.sum(axis=0) for of_frames in sums))
 
 
 def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> float:
-    """Return the robust misfit of a fit."""
-    total, count = residuals(strip, state, fit, use, margin_px).misfit
-    return float(total / max(count, 1))
+    """Return the robust misfit of a fit, the mean of log(1 + r²/9v). v does not depend on the blur: a wider one would
+    lower its own misfit.
+    """
+    (_, weight, _, of_pixel), _ = residuals(strip, state, fit, use, margin_px)
+    return float(of_pixel.sum(dtype=float) / max(np.count_nonzero(weight), 1))
 
 
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
@@ -223,10 +217,11 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        by_row = residuals(strip, state, fit, slow).by_row
-        step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
+        (residual, weight, slope, _), _ = residuals(strip, state, fit, slow)
+        slope_of_row, known = ((weight * slope * factor).sum(axis=(0, 2), dtype=float) for factor in (residual, slope))
+        step = slope_of_row / (known + 0.02 * float(known.max()) + 1e-9)
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
-        lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
+        lag, lead = _smooth_lag(state.lag + step, known)
         state = replace(state, lag=lag, edge=state.edge - lead)
     # 16: frames from which the blur is estimated (chosen)
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
@@ -250,50 +245,39 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        by_place = residuals(strip, state, fit, core).by_place
-        middle = by_place.shape[1] // 2
-        residual, weight = by_place[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
-        step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
+        (residual, weight, *_), fraction = residuals(strip, state, fit, core)
+        # The row's edge lies between two whole columns: each pixel counts in two bins.
+        sums = np.zeros((2, weight.shape[2]))
+        for total, part in zip(sums, (weight * residual, weight), strict=True):
+            ahead = np.einsum("tu,tud->d", fraction, part)
+            total[:] = part.sum(axis=(0, 1), dtype=float) - ahead
+            total[:-1] += ahead[1:]
+        middle = sums.shape[1] // 2
+        residual_sum, known = sums[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
+        step = residual_sum / np.maximum(known, 1e-3 * float(known.max()) + 1e-12)
         # (0.25, 0.5, 0.25): smoothing kernel of the tip's shading (chosen)
         state = replace(state, shading=np.convolve(state.shading + step, (0.25, 0.5, 0.25), mode="same"))
     return state
 
 
-def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
-    """Exposure, in frame periods, that explains the blur of the faster frames best. It is ASSUMED_EXPOSURE where no
-    frame moves 2 px. Shapes: fit (n_frames, 6).
-    """
-    _, fast, misfits = _misfits_of_exposures(strip, state, fit, EXPOSURES)
-    return _least_misfit(EXPOSURES, misfits) if fast.any() else ASSUMED_EXPOSURE
-
-
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
-    """Find the exposure that the blur shows where it contradicts the stated one. Returns exposure over frame period,
-    NaN where the stated one explains the blur as well; and the median speed of the frames used, px a frame.
-    """
-    speed, fast, misfits = _misfits_of_exposures(strip, state, fit, np.append(EXPOSURES, stated_frames))
-    # 6: fewest frames from which a blur is told from the shape of the tip (chosen)
-    if fast.sum() < 6:
-        return np.nan, np.nan
-    # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
-    contradicted = misfits[-1] > 1.01 * misfits.min()
-    seen = _least_misfit(EXPOSURES, misfits[:-1]) if contradicted else np.nan
-    return seen, float(np.median(speed[fast]))
-
-
-def _misfits_of_exposures(
-    strip: Strip, state: EdgeState, fit: Floats, exposures: Floats
-) -> tuple[Floats, Bools, Floats]:
-    """Speed in every frame, px a frame; the faster half of the core frames among those that move 2 px; and their misfit
-    with each exposure, shape (n_exposures,), without the tip's shading, which looks like any error of the exposure at
-    constant speed.
+    """Find the exposure that the blur of the faster frames shows, without the tip's shading, which looks like any error
+    of the exposure at constant speed. Returns exposure over frame period, NaN where a stated one explains the blur as
+    well or too few frames move 2 px; and the median speed of the frames used, px a frame.
     """
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)
     fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
-    bare = replace(state, shading=np.zeros_like(state.shading))
-    misfits = [misfit(strip, replace(bare, lengths=speed * tau), fit, fast) for tau in exposures if fast.any()]
-    return speed, fast, np.array(misfits)
+    # 6: fewest frames from which a blur is told from the shape of the tip (chosen)
+    if fast.sum() < 6:
+        return np.nan, np.nan
+    bare, tried = replace(state, shading=np.zeros_like(state.shading)), EXPOSURES.tolist()
+    tried += [stated_frames] if np.isfinite(stated_frames) else []
+    misfits = np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, fast) for tau in tried])
+    # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
+    agrees = len(tried) > len(EXPOSURES) and misfits[-1] <= 1.01 * misfits.min()
+    seen = np.nan if agrees else _least_misfit(EXPOSURES, misfits[: len(EXPOSURES)])
+    return seen, float(np.median(speed[fast]))
 
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:

@@ -188,10 +188,11 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     # 0.04, 2.5: smaller shake is not removed, px (chosen), and one of so many standard errors is noise (derived)
     least_px = np.maximum(0.04, 2.5 * np.median(sigma, axis=0))
     if (np.median(np.abs(fit[:, 2:]), axis=0) > least_px).any():
-        halves = [_followed(luma, part, picks)[1:] for part in np.array_split(places, 2)]
-        if shifts_agree(*halves):
-            fit, shift, _ = _followed(luma, places, picks)
-            shaken = True
+        moving, moved = _followed(luma, places, picks)
+        parts = np.array_split(places, 2)
+        halves = [register(luma, part, _reference(luma[picks], part, moved[picks]), moved) for part in parts]
+        if shifts_agree(*((moved + fit_of[:, 2:], sigma_of) for fit_of, sigma_of in halves)):
+            fit, shift, shaken = moving, moved, True
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
 
@@ -213,20 +214,20 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
     return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
 
-def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats, Floats]:
-    """Register every frame again and again, each time from where it was found: fit, shift and its standard error."""
+def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats]:
+    """Register every frame again and again, each time from where it was found: fit and shift."""
     largest_step_px, converged_px = 1.5, 0.02  # Largest shift of one round, and change that is none (chosen)
     basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
     # 4: number of registrations, each from the result of the one before (chosen)
     for turn in range(4):
-        fit, sigma = register(luma, places, basis, shift if turn else None)
+        fit, _ = register(luma, places, basis, shift if turn else None)
         step = np.clip(fit[:, 2:], -largest_step_px, largest_step_px)
         shift = shift + step
         if turn == 0:
             basis = _reference(luma[picks], places, shift[picks])  # sharper than that of the shaken pictures
         elif np.abs(step).max() < converged_px:
             break
-    return fit, shift, sigma
+    return fit, shift
 
 
 def shifts_agree(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> bool:
