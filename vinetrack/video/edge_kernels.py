@@ -340,35 +340,48 @@ def residuals(
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Pixels about the edge, by distance ahead of the whole column of their row's own edge, in the bins of `shading`:
-    residual r, weight (0 where there is no pixel), derivative of the model with respect to the row's lag, and log(1 +
-    r²/9v), with v the mean of the variances of film and background, shape (4, n_used, n_across, n_distances). And the
-    part of a column by which the edge lies further, (n_used, n_across). Shapes: fit (n_frames, 6); frames (n_used,).
+    residual r, weight (0 where there is no pixel), derivative of the model by the row's lag, and r²/9v, v the mean of
+    both variances, shape (4, n_used, n_across, n_distances). And the part of a column by which the
+    edge lies further, (n_used, n_across). Shapes: fit (n_frames, 6); frames (n_used,).
     """
     _, rows, columns = strip.shape
     out, fractions = np.zeros((4, len(frames), rows, len(shading)), np.float32), np.zeros((len(frames), rows))
+    unit, ninth, shading32 = np.float32(1.0), np.float32(1 / 9), shading.astype(np.float32)
     for used in range(len(frames)):
         t = frames[used]
-        y, length, gain, level = fit[t, 0], lengths[t], 1 + fit[t, 3], fit[t, 4]
+        y, length = fit[t, 0], lengths[t]
+        gain, level, factor, dark = (
+            np.float32(1 + fit[t, 3]),
+            np.float32(fit[t, 4]),
+            np.float32(scale[t]),
+            np.float32(offset[t]),
+        )
         half = coverage_reach(length, blur) + margin
-        table, middle = coverage_table(length, blur, half), math.ceil(half) + 1
+        table, middle = coverage_table(length, blur, half).astype(np.float32), math.ceil(half) + 1
         first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
         for u in range(rows):
             row_edge = y - lag[u]
-            whole_px, j, f = subpixel_index(row_edge)
+            whole_px, j, table_fraction = subpixel_index(row_edge)
             a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
-            fraction = row_edge - whole_px
-            fractions[used, u] = fraction
-            for s in range(a, b):
-                k, d = s - whole_px + middle, s - whole_px + (len(shading) - 1) // 2
-                p = table[0, j, k] + f * (table[0, j + 1, k] - table[0, j, k])
-                slope = table[1, j, k] + f * (table[1, j + 1, k] - table[1, j, k])
-                film, background = appearance[0, u, s], appearance[1, u, s]
-                film_variance, background_variance = appearance[2, u, s], appearance[3, u, s]
-                shade = shading[d] + fraction * (shading[d - 1] - shading[d])
-                modelled = background + (film - background) * (gain * p + level) + shade
-                r = strip[t, u, s] * scale[t] + offset[t] - modelled
-                out[0, used, u, d] = r
-                out[1, used, u, d] = 1 / (p * p * film_variance + (1 - p) * (1 - p) * background_variance + r * r / 9)
-                out[2, used, u, d] = (background - film) * slope
-                out[3, used, u, d] = math.log1p(r * r / (4.5 * (film_variance + background_variance)))
+            fractions[used, u] = row_edge - whole_px
+            if b <= a:
+                continue
+            k, m, d = a - whole_px + middle, b - a, a - whole_px + (len(shading) - 1) // 2
+            f, fraction = np.float32(table_fraction), np.float32(row_edge - whole_px)
+            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+            low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
+            values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+            film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+            shade_before, shade_after = shading32[d - 1 : d - 1 + m], shading32[d : d + m]
+            residual, weight = out[0, used, u, d : d + m], out[1, used, u, d : d + m]
+            slope, square = out[2, used, u, d : d + m], out[3, used, u, d : d + m]
+            for i in range(m):
+                p, contrast = low[i] + f * (high[i] - low[i]), film[i] - background[i]
+                modelled = background[i] + contrast * (gain * p + level)
+                modelled += shade_after[i] + fraction * (shade_before[i] - shade_after[i])
+                r = np.float32(values[i]) * factor + dark - modelled
+                variance = p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
+                residual[i], weight[i] = r, unit / (variance + r * r * ninth)
+                slope[i] = -contrast * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
+                square[i] = np.float32(2.0) * ninth * r * r / (film_variance[i] + background_variance[i])
     return out, fractions

@@ -189,8 +189,8 @@ def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: f
     """Return the robust misfit of a fit, the mean of log(1 + r²/9v). v does not depend on the blur: a wider one would
     lower its own misfit.
     """
-    (_, weight, _, of_pixel), _ = residuals(strip, state, fit, use, margin_px)
-    return float(of_pixel.sum(dtype=float) / max(np.count_nonzero(weight), 1))
+    (_, weight, _, square), _ = residuals(strip, state, fit, use, margin_px)
+    return float(np.log(1 + square).sum(dtype=float) / max(np.count_nonzero(weight), 1))
 
 
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:

@@ -1,4 +1,4 @@
-"""Search for fronts: monotone paths through what changes in order."""
+"""Compiled search for fronts: when each pixel changes, and monotone paths through what changes in order."""
 
 from __future__ import annotations
 
@@ -9,6 +9,35 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
+
+
+@njit(nogil=True)
+def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the first picture after the largest step of each pixel's mean brightness, and the power of that step,
+    (n_pixels,) each. Shapes: pictures (n, n_pixels).
+    """
+    n, pixels = pictures.shape
+    best, step_frame = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
+    block = 512
+    sums = np.zeros((n + 1, block), np.float32)
+    for start in range(0, pixels, block):
+        stop = min(start + block, pixels)
+        for t in range(n):
+            for k in range(stop - start):
+                sums[t + 1, k] = sums[t, k] + pictures[t, start + k]
+        for t in range(1, n):
+            a, b = min(n, t + window), max(0, t - window)
+            after, before = np.float32(a - t), np.float32(t - b)
+            factor = np.float32((a - t) * (t - b) / (a - b))
+            sum_after, sum_here, sum_before = sums[a], sums[t], sums[b]
+            top, place = best[start:stop], step_frame[start:stop]
+            for k in range(stop - start):
+                step = (sum_after[k] - sum_here[k]) / after - (sum_here[k] - sum_before[k]) / before
+                score = factor * step * step
+                place[k] = t if score > top[k] else place[k]
+                top[k] = max(score, top[k])
+    return step_frame, best
+
 
 # Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)
 END_FRAMES = 5

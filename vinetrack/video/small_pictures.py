@@ -25,6 +25,7 @@ from vinetrack.video.frames import (
     quiet_log,
     read_frames,
 )
+from vinetrack.video.kymograph import largest_steps
 
 MAX_FRAMES = 150  # Maximum number of frames in which the axis is sought, spread evenly over the changes (chosen)
 MIN_GROWN_PART = 0.16  # Part of all change that must be growth (chosen)
@@ -105,15 +106,7 @@ def changed_pixels(small: NDArray[np.float32]) -> Pixels:
     frames, noise_power = _busy_frames(small)
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
-    # The first picture after the largest step of each pixel's mean brightness, and the power of that step
-    sums = np.concatenate([np.zeros_like(frames[:1]), np.cumsum(frames, axis=0)])
-    best, frame = np.zeros_like(frames[0]), np.zeros(frames.shape[1:], int)
-    for t in range(1, n):
-        before, after = t - max(0, t - window), min(n, t + window) - t
-        step = (sums[t + after] - sums[t]) / after - (sums[t] - sums[t - before]) / before
-        power = after * before / (after + before) * step**2
-        frame[power > best] = t
-        best = np.maximum(best, power)
+    frame, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
     floor = max(30.0 * noise_power, 0.02 * float(np.quantile(best, 0.995)))
     weight = np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
     rows, columns = np.nonzero(weight > 0)

@@ -188,11 +188,11 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     # 0.04, 2.5: smaller shake is not removed, px (chosen), and one of so many standard errors is noise (derived)
     least_px = np.maximum(0.04, 2.5 * np.median(sigma, axis=0))
     if (np.median(np.abs(fit[:, 2:]), axis=0) > least_px).any():
-        moving, moved = _followed(luma, places, picks)
-        parts = np.array_split(places, 2)
-        halves = [register(luma, part, _reference(luma[picks], part, moved[picks]), moved) for part in parts]
-        if shifts_agree(*((moved + fit_of[:, 2:], sigma_of) for fit_of, sigma_of in halves)):
-            fit, shift, shaken = moving, moved, True
+        parts = zip(*(np.array_split(of_pixel, 2) for of_pixel in (places, basis.T)), strict=True)
+        halves = [register(luma, part, of_part.T, None) for part, of_part in parts]
+        if shifts_agree(*((fit_of[:, 2:], sigma_of) for fit_of, sigma_of in halves)):
+            fit, shift = _followed(luma, places, picks)
+            shaken = True
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
 
