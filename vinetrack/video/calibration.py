@@ -319,10 +319,11 @@ class PlaneMap:
         for k, step in enumerate(steps):
             change = np.zeros(self.parameters.size)
             change[k] = step
-            lower, upper = (_length(self._plane_m(self.parameters + sign * change, places_px)) for sign in (-1, 1))
+            moved = (self._plane_m(self.parameters + sign * change, places_px) for sign in (-1, 1))
+            lower, upper = (length_along(path_m)[-1] for path_m in moved)
             gradient[k] = (upper - lower) / (2 * step)
         variance = float(gradient @ self.covariance @ gradient)
-        return float(np.sqrt(max(variance, 0.0))) / _length(self.plane_m(places_px))
+        return float(np.sqrt(max(variance, 0.0)) / length_along(self.plane_m(places_px))[-1])
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
         size = (self.width_px, self.height_px)
@@ -330,11 +331,6 @@ class PlaneMap:
         homography = np.append(parameters[:8], 1.0).reshape(3, 3)
         projected = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ homography.T
         return np.asarray(projected[..., :2] / projected[..., 2:])
-
-
-def _length(path_m: Floats) -> float:
-    """Length of a path through places of the plane, shape (n, 2), m."""
-    return float(sum(np.linalg.norm(step) for step in np.diff(path_m, axis=0)))
 
 
 def _half_diagonal_px(width_px: int, height_px: int) -> float:

@@ -38,7 +38,6 @@ from vinetrack.video.edge_state import (
     fit_edges,
     hold_at_rest,
     informative_frames,
-    initial_state,
     moving_frames,
     search_edges,
     seen_exposure,
@@ -219,17 +218,16 @@ GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
-FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
 
 
-def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, bool]:
+def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
     """Look for a launcher's mouth: a straight border that stays where the edge rested. Returns the frames in which the
-    edge stands there, (n_frames,), and whether the tip moved behind it.
+    edge stands there and the tip may move behind it, (n_frames,).
     """
     fewest_rest_frames = 3  # Fewest frames of rest from which the resting place is known (chosen)
     film_range_px = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
     search_px = 3  # Distance from the resting place within which a border is looked for (chosen)
-    none = np.zeros(len(edge), dtype=bool), False
+    none = np.zeros(len(edge), dtype=bool)
     first = int(np.flatnonzero(moving_frames(state.edge))[0])
     if first < fewest_rest_frames:
         return none
@@ -264,17 +262,7 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     # 0.95: part of the rows that must show the border with the same sign (measured)
     if straight < 0.95 or abs(border_step) < least_step:
         return none
-    clear_px = rest_px + 3 * state.blur + 1
-    exit_frame = first + int(np.argmax(edge[first:] > clear_px))
-    after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
-    at_mouth = np.arange(len(edge)) < exit_frame
-    if len(after_exit) < FRAMES_AFTER_EXIT:
-        return at_mouth, False
-    # From rest under its present acceleration a the tip would have come v²/2a, with v its present speed; this is
-    # compared with the way from the resting place. As much again, and 5 px, are allowed for an acceleration that falls.
-    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), after_exit, 2)
-    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
-    return at_mouth, bool(run_up_px > 2 * (start_px - rest_px) + 5)
+    return np.arange(len(edge)) < first + int(np.argmax(edge[first:] > rest_px + 3 * state.blur + 1))
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
@@ -328,10 +316,9 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
 # several frames are averaged at either end.
 
 
-def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[np.float32]]:
-    """Find the initial path of the front and the columns that it leaves permanently changed. Returns column of the
-    front by frame, shape (n_frames,), px; first column passed, and the one behind the last; and brightness of film and
-    background, shape (2, n_across, n_along).
+def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
+    """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
+    film and background for a straight tip and a typical blur; and first column passed, and the one behind the last.
     """
     ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
     last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
@@ -346,7 +333,9 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[n
     looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
     votes = [((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks]
     path, passed = _trim_to_changed_runs(ky.dividing_path(np.stack(votes)), power)
-    return path, passed, initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2]
+    blank = np.zeros((4, *first.shape), np.float32)
+    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, blank)
+    return estimate_appearance(strip, state, 0.0), passed
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -391,9 +380,8 @@ def follow_edge(look: Look) -> Positions | None:
         return None
     strip, tube = outlined
     rounds = 4  # Fewest rounds of the alternation (chosen)
-    path, passed, exposure_frames = tube.path_px, tube.passed, look.exposure_frames
+    state, path, passed, exposure_frames = tube.state, tube.state.edge, tube.passed, look.exposure_frames
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
-    state = initial_state(strip, path, exposure)
     for iteration in range(3):
         contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
         width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
@@ -440,7 +428,7 @@ class Outline:
     half_px: float
     width_px: float
     width_sigma_px: float
-    path_px: Floats
+    state: EdgeState
     passed: tuple[int, int]
     places_px: Floats
     middles_px: Floats
@@ -451,8 +439,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
     degrees off and would cut the tube obliquely.
     """
-    path, passed, look = initial_front_path(strip)
-    film, background = look[:, :, passed[0] : passed[1]]
+    state, passed = initial_front_path(strip)
+    film, background = state.appearance[:2, :, passed[0] : passed[1]]
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
@@ -476,21 +464,17 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     faint = 0.15 * median_width if float(np.median(contrasts)) < 25.0 else 0.0
     # 1.0: error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
     sigma = float(np.linalg.norm([width_error, 1.0, faint]))
-    return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, path, passed, place, centre)
+    return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, state, passed, place, centre)
 
 
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
     """Return the ends of the run with the greatest sum, interpolated to a fraction of a row (maximum-subarray search).
     Short gaps do not end the run and isolated glints do not extend it.
     """
-    best, run_sum, start, limits = -np.inf, 0.0, 0, (0, len(excess) - 1)
-    for i, value in enumerate(excess):
-        if run_sum <= 0:
-            run_sum, start = 0.0, i
-        run_sum += value
-        if run_sum > best:
-            best, limits = run_sum, (start, i)
-    return _zero_crossing(excess, limits[0], -1), _zero_crossing(excess, limits[1], 1)
+    total = np.concatenate([[0.0], np.cumsum(excess)])
+    last = int(np.argmax(total[1:] - np.minimum.accumulate(total[:-1])))
+    first = int(np.argmin(total[: last + 1]))
+    return _zero_crossing(excess, first, -1), _zero_crossing(excess, last, 1)
 
 
 def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
@@ -606,8 +590,8 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     # 3.0: factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
     visible_error = np.hypot(bands * (3.0 if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
     extra = hidden_errors(fit, misfit_ratio, edge_now, visible_error)
-    in_mouth, moved_behind = find_mouth(strip, state, edge_now)
-    extra = np.where(in_mouth, np.maximum(extra, NO_EDGE_PX if moved_behind else GUESSED_PX), extra)
+    in_mouth = find_mouth(strip, state, edge_now)
+    extra = np.where(in_mouth, np.maximum(extra, NO_EDGE_PX), extra)
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | in_mouth
     # Unsure is a poor fit: odd contrast, large misfit, disagreeing bands, hidden, uncertain.

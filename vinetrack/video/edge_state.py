@@ -193,13 +193,6 @@ def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: f
     return float(np.log(1 + square).sum(dtype=float) / max(np.count_nonzero(weight), 1))
 
 
-def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
-    """Estimate film and background from an initial path of the front, with a straight tip and a typical blur."""
-    blank = np.zeros((4, *strip.values.shape[1:]), np.float32)
-    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(blank.shape[1]), 2.0, blank)
-    return estimate_appearance(strip, state, 0.0)
-
-
 # ------------------------------------------------------------------------------
 # Estimate the tip's shape and shading, the optical blur and the exposure from the residuals of the edge fit.
 
