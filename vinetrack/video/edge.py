@@ -36,7 +36,6 @@ from vinetrack.video.edge_state import (
     find_shading,
     find_shape,
     fit_edges,
-    hold_at_rest,
     informative_frames,
     moving_frames,
     search_edges,
@@ -393,8 +392,9 @@ def follow_edge(look: Look) -> Positions | None:
     fit = fit_edges(strip, state, informative_frames(state.edge))
     for iteration in range(3 * rounds):
         before = fit[:, 0]
-        # Take over the fitted edges; blur lengths, film and background follow from them.
-        edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
+        # Take over the fitted edges, and hold them at rest; blur lengths, film and background follow from them.
+        edge, fitted = np.where(np.isfinite(before), before, state.edge), np.flatnonzero(informative_frames(state.edge))
+        edge = edge[np.clip(np.arange(len(edge)), fitted[0], fitted[-1])]
         state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
         state = estimate_appearance(strip, state, 4 * strip.noise + 4)
         informative = informative_frames(state.edge)

@@ -68,14 +68,6 @@ def informative_frames(edge: Floats) -> Bools:
     return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
 
 
-def hold_at_rest(edge: Floats, informative: Bools) -> Floats:
-    """Set the edge outside the informative frames to its value at the first and last of them. Shapes: edge, informative
-    (n_frames,) → (n_frames,).
-    """
-    frames = np.flatnonzero(informative)
-    return np.asarray(edge[np.clip(np.arange(len(edge)), frames[0], frames[-1])])
-
-
 def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
     """Estimate the brightness of film and background at every pixel, given the edge."""
     ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)

@@ -52,7 +52,7 @@ class Shot(NamedTuple):
 
 
 def film_shots(
-    recording: Recording, said: list[Said], span: tuple[int, int] | None = None, chosen: Container[int] | None = None
+    recording: Recording, said: list[Said], span: tuple[int, int] | None = None, chosen: Container[float] | None = None
 ) -> Generator[tuple[NDArray[Any], Shot]]:
     """Decode a film: all of it, from a tick to another, or the packets of chosen ticks alone. A frame is corrupt as the
     decoder marks it, or as it says of the packet in `said`, to which it adds what it says. A packet that cannot be

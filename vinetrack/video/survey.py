@@ -118,8 +118,10 @@ def _seen(target: Calibration, folder: Path, width_px: int, height_px: int, _sta
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
     """Return the growth axis of the sheet, else of the settings."""
-    drawn = trial.axis or (settings.axis and settings.axis.in_picture)
-    return drawn and axis_through((drawn.from_px, *drawn.via_px, drawn.to_px), drawn.width_m / m_per_px)
+    drawn = settings.axis.in_picture if trial.axis is None and settings.axis else trial.axis
+    if drawn is None:
+        return None
+    return axis_through((drawn.from_px, *drawn.via_px, drawn.to_px), drawn.width_m / m_per_px)
 
 
 def proposed_axis(luma: NDArray[Any]) -> Axis:
