@@ -23,7 +23,6 @@ from pydantic.fields import FieldInfo
 from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
-from vinetrack.core.records import PictureAxis
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, did_you_mean, read_range
@@ -75,12 +74,6 @@ class AxisSettings(_TwoEnds):
     """Intermediate points of a curved path, in order; a smooth curve passes through all."""
     width_mm: Annotated[Positive | None, "About the diameter of the vine."] = None
     """Width of the strip along the axis that is tracked."""
-
-    @property
-    def in_picture(self) -> PictureAxis:
-        """The axis as a cell of the sheet would give it."""
-        width_m = math.nan if self.width_mm is None else self.width_mm / 1e3
-        return PictureAxis(self.from_px, self.to_px, width_m, self.via_px or ())
 
 
 class MmPerPx(_Strict):

@@ -118,10 +118,14 @@ def _seen(target: Calibration, folder: Path, width_px: int, height_px: int, _sta
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
     """Return the growth axis of the sheet, else of the settings."""
-    drawn = settings.axis.in_picture if trial.axis is None and settings.axis else trial.axis
-    if drawn is None:
+    if (of_trial := trial.axis) is not None:
+        width_px, through = of_trial.width_m / m_per_px, (of_trial.from_px, *of_trial.via_px, of_trial.to_px)
+    elif (shared := settings.axis) is not None:
+        width_px = math.nan if shared.width_mm is None else shared.width_mm / 1e3 / m_per_px
+        through = shared.from_px, *(shared.via_px or ()), shared.to_px
+    else:
         return None
-    return axis_through((drawn.from_px, *drawn.via_px, drawn.to_px), drawn.width_m / m_per_px)
+    return axis_through(through, width_px)
 
 
 def proposed_axis(luma: NDArray[Any]) -> Axis:
