@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,11 +12,11 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import diagnose, result, selection
+from vinetrack.diagnosis import between_trials, diagnose, result, selection
 from vinetrack.diagnosis import ladder as ladder_module
-from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
+from vinetrack.diagnosis.between_trials import Difference, between_fits, confounded, differences, significant
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
-from vinetrack.diagnosis.likelihood_ratio import Difference, robust_ratio
+from vinetrack.diagnosis.likelihood_ratio import robust_ratio
 from vinetrack.diagnosis.locate import drift, locate, per_trial_estimates
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
@@ -324,7 +325,8 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
 
 @pytest.mark.parametrize("sd", ["B_sd", "pressure_sd_Pa", "gain_sd"])
 def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_deviation(trials, monkeypatch, sd):
-    monkeypatch.setitem(result.BETWEEN, "day", result.BetweenHypothesis("days differ", "film again", **{sd: 0.03}))
+    forms = partial(between_trials.of_column, **{sd: 0.03})
+    monkeypatch.setitem(between_trials.BETWEEN, "day", between_trials.BetweenHypothesis("days differ", "again", forms))
     known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
     found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9), profile=False))
     assert [len(each.terms) for each in found if each.name == "day"] == [1]

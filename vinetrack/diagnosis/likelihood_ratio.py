@@ -6,125 +6,17 @@ The answer set holds every hypothesis that the data cannot exclude.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
-import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
+from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
 from vinetrack.diagnosis.score_test import is_plausible
 from vinetrack.effects import Effect
 from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
-from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
-from vinetrack.inference.marginal_likelihood import (
-    deviance,
-    estimate_between_trial_sd,
-    marginal,
-)
-from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
-from vinetrack.inference.systematics import with_unknowns
-
-# ------------------------------------------------------------------------------
-# Likelihood gain of a difference between trials, from the linear mixed model of a fit, without simulations.
-
-
-@dataclass(frozen=True)
-class Difference:
-    """One hypothesis that trials differ."""
-
-    name: str
-    terms: tuple[BetweenTerm, ...] = ()
-    shared: Mapping[str, str] = field(default_factory=dict)
-    stated: bool = True
-    confounded: bool = True
-    n_forms: int = 1
-    gain: float = 0.0
-    p: float = 1.0
-
-    @property
-    def penalised_gain(self) -> float:
-        """Fall of −2 ln L less the penalty 2 ln(`n_forms`) for the choice among forms."""
-        return self.gain - 2 * math.log(self.n_forms)
-
-
-def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
-    """p-value of a gain where trials do not differ. For fixed coefficients by the F test, LR = N ln(1 + q F / dof),
-    because χ² would be anticonservative for few trials. For random effects of given standard deviations exp(gain / 2)
-    would be a Bayes factor K, with P(K > 1/α) ≤ α by Markov's inequality, were it not for parameters and scatter, which
-    both hypotheses fit: in simulations of 8 to 24 trials in 2 to 6 groups, α was exceeded by no more than 0.07 α.
-    """
-    from scipy.stats import f as fisher
-
-    if gain <= 0:
-        return 1.0
-    if any(math.isfinite(term.prior_sd) for term in difference.terms):
-        return min(1.0, math.exp(-0.5 * gain))
-    trials = len(fit.trials)
-    vines = len({trial.trial.vine for trial in fit.trials})
-    extra = vines - 1 if difference.name == N_BY_VINE else len(difference.terms)
-    spare = max(trials - int(np.count_nonzero(fit.predictor.layout.prior_precision == 0)) - extra, 1)
-    return float(fisher.sf(math.expm1(min(gain / trials, 500.0)) * spare / extra, extra, spare))
-
-
-def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[float, float] | None = None) -> float:
-    """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit. The deviation of each trial is a
-    column of the linear mixed model already, and the columns of the coefficients are multiples of it.
-    """
-    return _deviance(base, base, spread) - _deviance(_widened(fit, base, difference), base, spread)
-
-
-def _deviance(solution: Solution, base: Solution, spread: tuple[float, float] | None = None) -> float:
-    """−2 ln L, minimised over the parameters and, unless given, the between-trial standard deviations that `base`
-    estimates.
-    """
-    problem, state = solution.problem, solution.state
-    part = marginal(solution.cross_products, problem, state)
-    if spread is None:
-        spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
-    return deviance(part, problem, state, spread, restricted=False)
-
-
-def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
-    """A solution with the coefficients of a difference added, all zero. Each is a multiple of a column that the
-    solution has: that of a trial's deviation, or of a parameter that vines shared.
-    """
-    columns, groups, factors, precisions = [], [], [], []
-    for term in difference.terms:
-        columns.append(PRESSURE if term.pressure else DAMPING_DEVIATION)
-        groups.append(term.groups)
-        factors.append(term.scale * term.regressor)
-        precisions.append((term.scale / term.prior_sd) ** 2)
-    for key, how in difference.shared.items():
-        columns.append(N_TRIAL_EFFECTS + fit.predictor.layout.keys.index(key))
-        of_trials = groups_of([trial.trial for trial in fit.trials], how)
-        groups.append(tuple("" if group == of_trials[0] else group for group in of_trials))
-        factors.append(np.ones(len(of_trials)))
-        precisions.append(0.0)
-    members = [[group for group in dict.fromkeys(of_trials) if group] for of_trials in groups]
-    first = base.problem.prior_mean.size + np.cumsum([0, *map(len, members)])
-    places = [
-        [begin + names.index(group) if group else -1 for group in of_trials]
-        for begin, names, of_trials in zip(first[:-1], members, groups, strict=True)
-    ]
-    precision = np.repeat(precisions, [len(names) for names in members])
-    problem = with_unknowns(base.problem, precision.size, precision)
-    problem = replace(
-        problem,
-        index=np.column_stack([base.problem.index, *places]),
-        random=np.append(base.problem.random, precision > 0),
-    )
-    size = base.cross_products.shape[-1]
-    T = np.zeros((len(base.cross_products), size, size + len(columns)))
-    T[:, range(size - 1), range(size - 1)] = T[:, -1, -1] = 1.0
-    for k, (column, factor) in enumerate(zip(columns, factors, strict=True)):
-        T[:, column, size - 1 + k] = np.where(problem.index[:, base.problem.index.shape[1] + k] >= 0, factor, 0.0)
-    cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
-    theta = np.append(base.state.theta, np.zeros(precision.size))
-    return replace(base, cross_products=cross_products, problem=problem, state=replace(base.state, theta=theta))
-
+from vinetrack.inference.fit_result import Fit, Number
 
 # ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.

@@ -69,46 +69,6 @@ MAX_STRETCHES = 8  # Most stretches of the growth over which a diagnosis and its
 
 BETWEEN_TRIALS = "between_trials"  # Kind of a hypothesis that trials differ
 
-N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen", "day")
-
-
-@dataclass(frozen=True)
-class BetweenHypothesis:
-    """A way in which trials differ. With standard deviations (ln B, P, ln P): between groups of the column so named."""
-
-    summary: str
-    remedy: str
-    B_sd: float = 0.0
-    pressure_sd_Pa: float = 0.0
-    gain_sd: float = 0.0
-
-
-# Hypotheses that trials differ, by their names in an answer set; standard deviations are chosen
-BETWEEN = {
-    N_BY_VINE: BetweenHypothesis(
-        "the exponent n differs between the vines",
-        "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-    ),
-    ORDER_DRIFT: BetweenHypothesis(
-        "B or the pressure drifts with the order of the trials",
-        "Repeat six trials in random order, number all in the column `order`, and read the gauge at each",
-    ),
-    SPECIMEN: BetweenHypothesis(
-        "specimens (tubes of one kind) differ",
-        "Film each specimen at several pressures, and name it in the column `specimen`",
-        B_sd=0.06,
-        pressure_sd_Pa=300.0,
-    ),
-    DAY: BetweenHypothesis(
-        "B or the zero of the gauge differs from day to day",
-        "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
-        B_sd=0.03,
-        pressure_sd_Pa=300.0,
-        gain_sd=0.03,
-    ),
-}
-
-
 # Codes of reasons of a richer form: a candidate that equals another in a limit, named `name`
 CONTAINS, CONTAINS_AND_FITS_NO_BETTER = "contains", "contains_and_fits_no_better"
 

@@ -10,20 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
+from vinetrack.diagnosis.between_trials import BETWEEN, N_BY_VINE, ORDER_DRIFT, SPECIMEN
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
-    BETWEEN,
     BETWEEN_TRIALS,
     DROPPED_FRAMES,
     EXPECTED,
     MISSING,
-    N_BY_VINE,
     NOT_TESTABLE,
-    ORDER_DRIFT,
     REFITTED,
-    SPECIMEN,
     UNEXPLAINED,
     Confounder,
 )
