@@ -124,7 +124,7 @@ def of_column(name: str, fit: Fit, _: Solution, **sd: float) -> list[Difference]
     """Differences between the groups of the text column so named, with these standard deviations, see `_of_groups`."""
     trials = [trial.trial for trial in fit.trials]
     stated = all(getattr(trial, name) for trial in trials)
-    return _of_groups(name, [trial.group(name) for trial in trials], trials, **sd) if stated else []
+    return _of_groups(name, [trial.group(name) for trial in trials], trials, stated, **sd) if stated else []
 
 
 def _of_specimens(name: str, fit: Fit, base: Solution, **sd: float) -> list[Difference]:
@@ -135,7 +135,9 @@ def _of_specimens(name: str, fit: Fit, base: Solution, **sd: float) -> list[Diff
     if all(trial.specimen for trial in trials):
         # A vine with a single tube has its own B already.
         tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
-        return _of_groups(name, [trial.group(name) if tubes[trial.vine] > 1 else "" for trial in trials], trials, **sd)
+        return _of_groups(
+            name, [trial.group(name) if tubes[trial.vine] > 1 else "" for trial in trials], trials, True, **sd
+        )
     if len(trials) < FEWEST_TRIALS:
         return []
     ranks, _ = trial_order(trials)
@@ -146,14 +148,14 @@ def _of_specimens(name: str, fit: Fit, base: Solution, **sd: float) -> list[Diff
         for first in range(MIN_TRIALS_EACH_SIDE, len(members) - MIN_TRIALS_EACH_SIDE + 1):
             after = set(members[first:])
             apart = [f"{vine}, later tube" if i in after else group for i, group in enumerate(groups)]
-            later.append(_of_groups(name, apart, trials, stated=False, **sd)[-1])
+            later.append(_of_groups(name, apart, trials, False, **sd)[-1])
         if later:
             groups = list(_likeliest(fit, base, later).terms[0].groups)
     conditions = [trial.condition for trial in trials]
-    changes = _of_groups(name, groups, trials, stated=False, **sd) if any(groups) else []
+    changes = _of_groups(name, groups, trials, False, **sd) if any(groups) else []
     made = [conditions[i] for i in np.argsort(ranks)]
     if 1 < len(set(made)) == len(list(itertools.groupby(made))) < len(made):
-        changes += _of_groups(name, conditions, trials, stated=False, **sd)
+        changes += _of_groups(name, conditions, trials, False, **sd)
     return changes
 
 
@@ -161,8 +163,9 @@ def _of_groups(
     name: str,
     groups: Sequence[str],
     trials: Sequence[Trial],
+    stated: bool,
+    /,
     *,
-    stated: bool = True,
     B_sd: float = 0.0,
     pressure_sd_Pa: float = 0.0,
     gain_sd: float = 0.0,
