@@ -96,7 +96,7 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     after = questioned(pairs_of(both_act), vt.base_model() + vt.effects.inlet_loss, LATER)
     place = after.ranked_shapes("air_drag")[0]
     k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
-    lever = float(score_test.levers_of(after.fit, after.products)[k, place])
+    lever = float(after.scores.levers[k, place]) * after.fit.predictor.layout.free[k].derivative(after.fit[INLET].value)
     drag = 0.2
     model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
     with_drag = vt.fit(model, after.fit.pairs, fixed=[DRAG], profile=False)

@@ -48,7 +48,7 @@ def power(six):
 
 
 def place_of(questions, name: str) -> int:
-    return questions.sensitivities.effects.index(name)
+    return questions.products.effects.index(name)
 
 
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():

@@ -23,7 +23,9 @@ FIRST, LATER = misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests.FALSE_AL
 def summed(single: np.ndarray, informations: np.ndarray, groups=()) -> Scores:
     named = list(groups) or [str(i) for i in range(len(single))]
     of_trials = np.einsum("njj->nj", informations)
-    return Scores(single.sum(axis=0), informations.sum(axis=0), single, of_trials, 1, named)
+    return Scores(
+        single.sum(axis=0), informations.sum(axis=0), single, of_trials, 1, named, np.zeros((0, len(of_trials.T)))
+    )
 
 
 def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes=0.0) -> Scores:
@@ -39,7 +41,7 @@ def questioned(of: Scores, level: float = FIRST, effects=()) -> MisfitTests:
     named = tuple(effects) or tuple(f"effect_{k}" for k in range(of.score.size))
     answers = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
     fit = None
-    return MisfitTests(fit, (), answers, fit, of, level)
+    return MisfitTests(fit, (), answers, of, level)
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
@@ -106,7 +108,7 @@ def test_what_one_of_many_probes_feels_alone_is_heard():
 def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(monkeypatch):
     of, answers = scores(np.random.default_rng(20607), 12, 2), SimpleNamespace(shapes=[None])
     shaped = scores(np.random.default_rng(20607), 12, 2, sizes=9.0)
-    for name in ("effect_sensitivities", "_probe_shapes", "products_of"):
+    for name in ("_probe_shapes", "products_of"):
         monkeypatch.setattr(misfit_tests, name, lambda *_: answers)
     monkeypatch.setattr(misfit_tests, "between_conditions_p", lambda _: 1.0)
     monkeypatch.setattr(misfit_tests, "scores_of", lambda *_: of)
@@ -150,13 +152,13 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, None
-    answers = score_test.EffectSensitivities((score_test.CandidateShape(friction, (), 1e-3),), [], ())
+    answers = score_test.Products((), (), None, 1, (score_test.CandidateShape(friction, (), 1e-3),))
     held = []
     for _ in range(2000):
         one = scores(draw, trials, 1, sizes=true * unit)
         more = scatter * np.sqrt(one.trial_informations) * draw.standard_normal((trials, 1))
         of = summed((one.trial_scores + more) * unit, one.trial_informations[:, :, None] * unit**2)
-        limits, testable = MisfitTests(fit, (friction,), answers, fit, of, FIRST).upper_limits(friction)
+        limits, testable = MisfitTests(fit, (friction,), answers, of, FIRST).upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
     assert 0.92 < np.mean(held) < 0.99
@@ -172,7 +174,7 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out(monkeypatch):
     problem = SimpleNamespace(index=places, places_of_pairs=np.tile([0, 1, 2, 4, 5, 6, 8, 9, 10], 12), **arrays)
     products = SimpleNamespace(problem=problem, n_unknowns=2, n_shapes=3)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
-    found = score_test.projected(SimpleNamespace(numbers=()), products, state)
+    found = score_test.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)
     total = blocks.sum(axis=0)
     A, B, C, inner = total[3:, 3:], total[3:, :2], total[:2, :2], np.linalg.inv(total[:2, :2] + np.eye(2))
     assert np.linalg.eigvalsh(C).min() > 1

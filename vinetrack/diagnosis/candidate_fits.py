@@ -145,7 +145,7 @@ class CandidateFits:
     @property
     def names(self) -> list[str]:
         """Effects to which trials respond, the largest predicted gain first."""
-        names = dict.fromkeys(self.tests.sensitivities.effects)
+        names = dict.fromkeys(self.tests.products.effects)
         return sorted(names, key=lambda name: -self.tests.predicted_gain(name))
 
     def tests_after(self, fit: Fit) -> MisfitTests:
@@ -178,7 +178,7 @@ class CandidateFits:
         """Fit an effect from its shapes of largest predicted gain, until one gains what is predicted."""
         self.report(f"fitting {name}")
         for index in self.tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
-            shape, size = self.tests.sensitivities.shapes[index], float(self.tests.scores.size[index])
+            shape, size = self.tests.products.shapes[index], float(self.tests.scores.size[index])
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = [known for known in self.fitted.values() if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)

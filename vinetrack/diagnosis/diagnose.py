@@ -148,7 +148,7 @@ def _settings(
 
 def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     tests = step.tests
-    names = tuple(dict.fromkeys(tests.sensitivities.effects))
+    names = tuple(dict.fromkeys(tests.products.effects))
     # Between effects, each in the shape of the largest predicted gain
     best_shapes = [tests.ranked_shapes(name)[0] for name in names]
     cosines = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
@@ -210,7 +210,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     for effect in (effect for name, effect in effects.items() if name not in singles):
         upper_limits, is_detectable = tests.upper_limits(effect)
         z = tests.best_z(effect.name)
-        if effect.name in tests.sensitivities.silent:
+        if effect.name in tests.products.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
         elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))

@@ -28,10 +28,8 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, PROB
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
-    effect_sensitivities,
     plausible_range,
     products_of,
-    projected,
     scores_of,
 )
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
@@ -89,15 +87,14 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
     """Expected score of an effect at a size, divided by that of linear theory. Returns 1 where the trajectories with
     the effect cannot be simulated, or the fit without it does not converge.
     """
-    shape, sigma = tests.sensitivities.shapes[shape_index], float(tests.scores.plain_sigma[shape_index])
+    shape, sigma = tests.products.shapes[shape_index], float(tests.scores.plain_sigma[shape_index])
     try:
         refit = fitted_without(start, shape, size)
         if not refit.solution.converged:
             return 1.0
-        sensitivities = effect_sensitivities(refit, [shape])
-        if not sensitivities.shapes:
+        scores = scores_of(refit, products_of(refit, [shape]))
+        if not scores.score.size:
             return 1.0
-        scores = scores_of(refit, products_of(refit, sensitivities))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
@@ -163,7 +160,7 @@ def power_of(
         n_trials=len(tests.fit.trials),
         false_alarm_rate=_false_alarm_rate(tests.fit),
         effects=tuple(power for power in powers if power is not None),
-        not_testable={**(not_testable or {}), **dict.fromkeys(tests.sensitivities.silent, remark("no_response"))},
+        not_testable={**(not_testable or {}), **dict.fromkeys(tests.products.silent, remark("no_response"))},
         numbers=_interval_widths(tests.fit),
         inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
@@ -191,9 +188,9 @@ def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
     none where no trial has information about it.
     """
     has_information = np.diag(tests.scores.information) > 0
-    indices = [k for k, of in enumerate(tests.sensitivities.effects) if of == name and has_information[k]]
-    small = [k for k in indices if not tests.sensitivities.shapes[k].whole]
-    return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(tests.sensitivities.shapes[k].step))
+    indices = [k for k, of in enumerate(tests.products.effects) if of == name and has_information[k]]
+    small = [k for k in indices if not tests.products.shapes[k].whole]
+    return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(tests.products.shapes[k].step))
 
 
 def _ends(shape: CandidateShape) -> tuple[float, float]:
@@ -223,7 +220,7 @@ def _effect_power(
     typical = typical_shapes(tests, effect.name)
     if not typical:
         return None
-    shapes = [tests.sensitivities.shapes[k] for k in typical]
+    shapes = [tests.products.shapes[k] for k in typical]
     shape, (near, far) = shapes[0], _ends(shapes[0])
     # Sizes (deviations from absence in SI, increasing in absolute value), and the expected scores of all shapes there
     information = tests.scores.information
@@ -235,7 +232,7 @@ def _effect_power(
         sizes, ratios = score_ratios(tests, typical[0], unit, start)
         scores = scores[0] * (ratios * sizes / unit)[:, None]
     scores = np.where(np.diag(information) > 0, scores, 0.0)
-    indices = [k for k, name in enumerate(tests.sensitivities.effects) if name == effect.name]
+    indices = [k for k, name in enumerate(tests.products.effects) if name == effect.name]
     expected = _sided(scores, tests.signs)
     index = max(indices, key=lambda k: float(expected[-1, k]))
     means = np.maximum.accumulate(np.maximum(expected[:, index], 0.0))
@@ -279,7 +276,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     model, and that of Student's t with the standard error found from the scatter of single trials.
     """
     scores = tests.scores
-    limit = tests.family.threshold(tests.sensitivities.effects[index])
+    limit = tests.family.threshold(tests.products.effects[index])
     passes = SCORE_GRID / inflation >= limit
     threshold = float(SCORE_GRID[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
@@ -316,7 +313,7 @@ def error_inflation(tests: MisfitTests) -> Floats:
     spreads = [(pressure, damping) for pressure, damping in (pairs * fit.state.spread).tolist()]
     penalties = scores.degrees * np.sum(2 * np.log(pairs) + 1 / pairs**2 - 1, axis=1)
     states = [replace(fit.state, spread=spread) for spread in spreads]
-    information = np.array([np.diag(projected(fit, tests.products, state).information) for state in states])
+    information = np.array([np.diag(scores_of(fit, tests.products, state).information) for state in states])
     remaining = np.clip(information / np.maximum(np.diag(scores.information), 1e-300), 1e-6, 1.0)
     costs = penalties[None, :, None] + SCORE_GRID[:, None, None] ** 2 * remaining
     best = np.argmin(costs, axis=1)
@@ -330,12 +327,12 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     """
     if np.isnan(mean).any():
         return {}
-    drawn, effects = null_scores + mean, np.array(tests.sensitivities.effects)
-    far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.sensitivities.shapes]
+    drawn, effects = null_scores + mean, np.array(tests.products.effects)
+    far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.products.shapes]
     with np.errstate(invalid="ignore"):
         credible = np.abs(drawn) <= CREDIBLE_RANGE_FACTOR * np.array(far) / tests.scores.plain_sigma + 3.0
     counted = np.maximum(np.where(credible, _sided(drawn, tests.signs), 0.0), 0.0) ** 2
-    names = list(dict.fromkeys(tests.sensitivities.effects))
+    names = list(dict.fromkeys(tests.products.effects))
     squares = np.stack([counted[:, effects == name].max(axis=1) for name in names], axis=1)
     limits = np.array([tests.family.threshold(name) for name in names])
     alarm = np.any(squares > limits**2, axis=1)

@@ -18,11 +18,9 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
-    EffectSensitivities,
     FamilyTest,
     Products,
     Scores,
-    effect_sensitivities,
     family_test,
     plausible_range,
     products_of,
@@ -177,11 +175,10 @@ def exceeds_slow_errors(fit: Fit) -> bool:
 
 @dataclass(frozen=True)
 class MisfitTests:
-    """Test statistics of one fit for every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
+    """Test statistics of one fit for every candidate. Arrays have shape (n_shapes,), see `Products`."""
 
     fit: Fit
     effects: tuple[Effect, ...]
-    sensitivities: EffectSensitivities
     products: Products
     scores: Scores
     level: float
@@ -194,16 +191,16 @@ class MisfitTests:
     @property
     def signs(self) -> list[int]:
         """Sign of each shape's size: 1 or −1 where physics fixes it, else 0."""
-        return [shape.size.sign if shape.effect.parameters else 1 for shape in self.sensitivities.shapes]
+        return [shape.size.sign if shape.effect.parameters else 1 for shape in self.products.shapes]
 
     @cached_property
     def family(self) -> FamilyTest:
         """Thresholds of z for the candidates, such that any exceeds its own by chance with probability `level`."""
-        return family_test(self.scores.cosines, self.signs, self.sensitivities.effects, self.level)
+        return family_test(self.scores.cosines, self.signs, self.products.effects, self.level)
 
     def largest_excess(self, family: FamilyTest) -> float:
         """Largest excess of a candidate's z over its threshold; negative where no candidate exceeds its own."""
-        thresholds = np.array([family.threshold(name) for name in self.sensitivities.effects])
+        thresholds = np.array([family.threshold(name) for name in self.products.effects])
         return float(np.max(self.one_sided_z - thresholds, initial=-math.inf))
 
     @property
@@ -230,16 +227,13 @@ class MisfitTests:
     @cached_property
     def rejects_at_first_round_level(self) -> bool:
         """Whether any candidate exceeds its threshold at the level of the first round."""
-        family = family_test(self.scores.cosines, self.signs, self.sensitivities.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+        family = family_test(self.scores.cosines, self.signs, self.products.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
         return self.largest_excess(family) > 0
 
     @cached_property
     def probes_reject(self) -> bool:
         """Whether a smooth force would improve the fit."""
-        answers = effect_sensitivities(self.fit, _probe_shapes(self.fit))
-        if not answers.shapes:
-            return False
-        scores = scores_of(self.fit, products_of(self.fit, answers))
+        scores = scores_of(self.fit, products_of(self.fit, _probe_shapes(self.fit)))
         return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
 
     @property
@@ -255,7 +249,7 @@ class MisfitTests:
 
     def ranked_shapes(self, name: str) -> list[int]:
         """Indices of an effect's shapes, the largest predicted gain first."""
-        indices = [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
+        indices = [i for i, effect in enumerate(self.products.effects) if effect == name]
         return sorted(indices, key=lambda i: -self.predicted_gains[i])
 
     def predicted_gain(self, name: str) -> float:
@@ -277,7 +271,7 @@ class MisfitTests:
         if not indices or not effect.parameters:
             return {}, bool(indices)
         size, sigma = self.scores.size[indices], self.scores.sigma[indices]
-        parameter = self.sensitivities.shapes[indices[0]].size
+        parameter = self.products.shapes[indices[0]].size
         largest_plausible = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
         if not np.isfinite(sigma).all() or largest_plausible < TESTABLE_SIGMAS * sigma.min():
             return {}, False
@@ -294,6 +288,5 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     effects = tuple(effect for effect in effects if effect.name not in fit.model)
     trials = [trial.trial for trial in fit.trials]
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
-    sensitivities = effect_sensitivities(fit, shapes)
-    products = products_of(fit, sensitivities)
-    return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), level)
+    products = products_of(fit, shapes)
+    return MisfitTests(fit, effects, products, scores_of(fit, products), level)

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from vinetrack.core.problems import Remark, remark
@@ -206,41 +205,23 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: f
 # products, from which score tests, cosines and expected gains follow by linear algebra.
 
 
-@dataclass(frozen=True)
-class EffectSensitivities:
-    """Changes of the positions of each trial, in the order of `shapes`, per unit of each size. `silent` names the
-    effects to which no trajectory responds at any plausible size.
-    """
-
-    shapes: tuple[CandidateShape, ...]
-    columns: list[list[Floats]]
-    silent: tuple[str, ...]
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Name of the effect of each shape."""
-        return tuple(shape.effect.name for shape in self.shapes)
-
-
-def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
-    """Compute the sensitivities to all shapes of all candidate effects. An effect to which no trajectory responds for a
-    small step is tried at finite sizes before it counts as silent.
+def _sensitivities(
+    fit: Fit, shapes: Sequence[CandidateShape]
+) -> tuple[list[tuple[CandidateShape, list[Floats]]], list[str]]:
+    """Sensitivities to all shapes of all candidate effects, and the effects to which no trajectory responds at any
+    plausible size: without a response to a small step finite sizes are tried.
     """
     baseline = fit.predictor.trajectories_at(fit.solution.state.theta, fit.solution.state.trial_effects)
-    responses: list[tuple[CandidateShape, list[Floats]]] = []
-    detected: set[str] = set()
-    names = dict.fromkeys(shape.effect.name for shape in shapes)
-    for name in names:
+    responses, silent = list[tuple[CandidateShape, list[Floats]]](), list[str]()
+    for name in dict.fromkeys(shape.effect.name for shape in shapes):
         of_effect = [shape for shape in shapes if shape.effect.name == name]
         responding = [each for shape in of_effect if (each := _sensitivity(fit, shape, baseline)) is not None]
         if not responding and any(shape.effect.parameters for shape in of_effect):
-            values = of_effect[0].other_values
-            finite = whole_shapes(of_effect[0].effect, [values])
+            finite = whole_shapes(of_effect[0].effect, [of_effect[0].other_values])
             responding = [each for shape in finite if (each := _sensitivity(fit, shape, baseline)) is not None]
         responses += responding
-        detected |= {name} if responding else set()
-    silent = tuple(name for name in names if name not in detected)
-    return EffectSensitivities(tuple(shape for shape, _ in responses), [moved for _, moved in responses], silent)
+        silent += [] if responding else [name]
+    return responses, silent
 
 
 def _sensitivity(
@@ -312,13 +293,21 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 @dataclass(frozen=True)
 class Products:
     """Columns of a fit, with its systematic errors, and of candidate shapes, shape (n_points, n_columns) a trial.
-    `problem` is that of the fit with the systematic errors as further parameters.
+    `problem` is that of the fit with the systematic errors as further parameters; `silent` names the effects to which
+    no trajectory responds at any plausible size.
     """
 
     columns: tuple[Floats, ...]
     data: Sequence[FitTrial]
     problem: MixedProblem
     n_shapes: int
+    shapes: tuple[CandidateShape, ...] = ()
+    silent: tuple[str, ...] = ()
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Name of the effect of each shape."""
+        return tuple(shape.effect.name for shape in self.shapes)
 
     @property
     def n_unknowns(self) -> int:
@@ -353,18 +342,18 @@ class Products:
         return all_products(self.columns[part], first, relative)
 
 
-def products_of(fit: Fit, sensitivities: EffectSensitivities) -> Products:
-    """Assemble the columns of a fit, of its systematic errors and of the candidates, which `sensitivities` lose: no
-    trial's are held twice.
-    """
+def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
+    """Assemble the columns of a fit, of its systematic errors and of the candidates; no trial's are held twice."""
+    responses, silent = _sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution)
     of_fit, problem = systematics.beside(fit.solution.columns), systematics.among(fit.solution.problem)
     assembled: list[Floats] = []
     for i, columns_of_trial in enumerate(of_fit):
-        assembled.append(np.column_stack([columns_of_trial, *(moved[i] for moved in sensitivities.columns)]))
-        for moved in sensitivities.columns:
+        assembled.append(np.column_stack([columns_of_trial, *(moved[i] for _, moved in responses)]))
+        for _, moved in responses:
             moved[i] = np.empty(0)
-    return Products(tuple(assembled), fit.predictor.data, problem, len(sensitivities.shapes))
+    responding = tuple(shape for shape, _ in responses)
+    return Products(tuple(assembled), fit.predictor.data, problem, len(responding), responding, tuple(silent))
 
 
 def products_without_trial_effects(products: Products, state: FitState) -> Floats:
@@ -383,7 +372,10 @@ def products_without_trial_effects(products: Products, state: FitState) -> Float
 
 @dataclass(frozen=True)
 class Scores:
-    """Score statistics of every shape given the fit, per unit of its size; those of trials (n_trials, n_shapes)."""
+    """Score statistics of every shape given the fit, per unit of its size; those of trials (n_trials, n_shapes).
+    `fitted` counts the parameters of the fit that are estimated; `levers` are the changes of the unknowns by a unit of
+    each size, (n_unknowns, n_shapes).
+    """
 
     score: Floats
     information: Floats
@@ -391,6 +383,7 @@ class Scores:
     trial_informations: Floats
     fitted: int
     groups: Sequence[str]
+    levers: Floats
 
     @property
     def degrees(self) -> float:
@@ -448,25 +441,11 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-@dataclass(frozen=True)
-class Projection:
-    """Shapes with the trial effects eliminated and the unknowns projected off. `blocks`, shape (n_trials, q, q), are
-    cross products of unknowns, residual and shapes; `lever` and `step` are the change of the unknowns by a unit of each
-    shape's size, and by the residual; `fitted` counts the parameters of the fit that are estimated.
+def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
+    """Compute the scores at a fit, or with another state of its noise: shapes and residual with the trial effects
+    eliminated and the unknowns projected off.
     """
-
-    blocks: Floats
-    lever: Floats
-    step: Floats
-    fitted: int
-    score: Floats
-    information: Floats
-    empty: NDArray[np.bool_]
-
-
-def projected(fit: Fit, products: Products, state: FitState) -> Projection:
-    """Project shapes and residual on the unknowns of a fit, with the trial effects eliminated."""
-    problem, p = products.problem, products.n_unknowns
+    state, problem, p = state or fit.state, products.problem, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
     blocks = products_without_trial_effects(products, state)
     # Systematic errors are at their prior means.
@@ -476,58 +455,34 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     cross = np.zeros((problem.prior_mean.size + 1, products.n_shapes))
     np.add.at(cross, problem.index, blocks[:, X, C])
     total = blocks[:, C, C].sum(axis=0)
-    estimated = _adapting(fit, problem, hessian)
-    inverse, fitted = inverse_of_block(hessian, estimated), int(np.count_nonzero(estimated < state.theta.size))
-    lever, step = inverse @ cross[:-1], inverse @ gradient
-    information, empty = _without_rounding(total - cross[:-1].T @ lever, total)
-    score = blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step
-    score[empty] = 0.0
-    return Projection(blocks, lever, step, fitted, score, information, empty)
-
-
-def levers_of(fit: Fit, products: Products) -> Floats:
-    """Bias of each parameter per unit of an omitted effect's size (omitted-variable bias), by the linear model. A
-    parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs in units of the parameter over those of
-    the size. Shape (n_numbers, n_shapes).
-    """
-    free = zip(fit.predictor.layout.free, fit.numbers, strict=True)
-    derivatives = np.array([parameter.derivative(number.value) for parameter, number in free])
-    return np.asarray(projected(fit, products, fit.state).lever[: derivatives.size] * derivatives[:, None])
-
-
-def scores_of(fit: Fit, products: Products) -> Scores:
-    """Compute the scores at a fit."""
-    projection, index, p = projected(fit, products, fit.state), products.problem.index, products.n_unknowns
-    X, r, C, blocks = slice(0, p), p, slice(p + 1, None), projection.blocks
-    # Unknowns to which a trial does not respond point at a last row of zeros.
-    lever, step = np.pad(projection.lever, ((0, 1), (0, 0)))[index], np.append(projection.step, 0.0)[index]
-    residual = blocks[:, :, r] - np.einsum("nap,np->na", blocks[:, :, X], step)
-    trial_scores = residual[:, C] - np.einsum("npk,np->nk", lever, residual[:, X])
-    trial_scores[:, projection.empty] = 0.0
-    trial_informations = np.einsum("nkk->nk", blocks[:, C, C]) + np.einsum(
-        "npk,npk->nk", lever, blocks[:, X, X] @ lever - 2 * blocks[:, X, C]
-    )
-    groups = coarsest_groups([trial.trial for trial in fit.trials])
-    return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)
-
-
-def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Information with the rows of shapes that other columns reproduce set to zero, and which these are. What the
-    projection leaves of such a shape is rounding. `before` is the information before the projection.
-    """
-    # 1e-9: share of its information below which what remains of a shape is rounding, because other columns
-    # reproduce it exactly (derived)
-    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(before), 1e-300)
-    cleaned = information.copy()
-    cleaned[empty, :] = cleaned[:, empty] = 0.0
-    return cleaned, empty
-
-
-def _adapting(fit: Fit, problem: MixedProblem, hessian: Floats) -> NDArray[np.intp]:
-    """Indices of the unknowns that adapt to an effect: those estimated that are not at a bound."""
+    # Those adapt to an effect that are estimated and not at a bound.
     at_bound = np.zeros(len(hessian), dtype=bool)
     at_bound[: len(fit.numbers)] = [math.isfinite(number.bound) for number in fit.numbers]
-    return np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~at_bound)
+    adapting = np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~at_bound)
+    inverse = inverse_of_block(hessian, adapting)
+    levers, step = inverse @ cross[:-1], inverse @ gradient
+    information = total - cross[:-1].T @ levers
+    # 1e-9: share of its information below which what remains of a shape is rounding, because other columns
+    # reproduce it exactly (derived)
+    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
+    information[empty, :] = information[:, empty] = 0.0
+    score = np.where(empty, 0.0, blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step)
+    # Of single trials; unknowns to which one does not respond point at a last row of zeros.
+    of_trial, steps = np.pad(levers, ((0, 1), (0, 0)))[problem.index], np.append(step, 0.0)[problem.index]
+    residual = blocks[:, :, r] - np.einsum("nap,np->na", blocks[:, :, X], steps)
+    trial_scores = residual[:, C] - np.einsum("npk,np->nk", of_trial, residual[:, X])
+    trial_informations = np.einsum("nkk->nk", blocks[:, C, C]) + np.einsum(
+        "npk,npk->nk", of_trial, blocks[:, X, X] @ of_trial - 2 * blocks[:, X, C]
+    )
+    return Scores(
+        score,
+        information,
+        np.where(empty, 0.0, trial_scores),
+        trial_informations,
+        fitted=int(np.count_nonzero(adapting < state.theta.size)),
+        groups=coarsest_groups([trial.trial for trial in fit.trials]),
+        levers=levers,
+    )
 
 
 # ------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
-from vinetrack.diagnosis.score_test import CandidateShape, levers_of, plausible_range
+from vinetrack.diagnosis.score_test import CandidateShape, plausible_range
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
@@ -223,7 +223,7 @@ def adequate_hypotheses(
 #
 # Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent.
 # If another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
-# coefficient of omitted-variable bias of the linear fit (`score_test.levers_of`). The estimate of s from the
+# coefficient of omitted-variable bias of the linear fit (`Scores.levers`). The estimate of s from the
 # trajectories, N(ŝ, σ_s²), is combined with a normal prior centred on zero, scaled so that 95 % of it lies within the
 # farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis).
 # Effects are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the
@@ -237,10 +237,10 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     """Find, for each size of the added effects, the physical effects that it may include, each in the shape that shifts
     it most. Returns for each size, those that could shift it by more than its standard error, the largest first.
     """
-    shapes, chosen = after.sensitivities.shapes, list[Confounder]()
-    levers = levers_of(after.fit, after.products) if shapes else ()
-    for number, lever in zip(after.fit.numbers, levers, strict=False):
-        name = number.key.split(".")[0]
+    shapes, chosen = after.products.shapes, list[Confounder]()
+    of_numbers = zip(after.fit.numbers, after.fit.predictor.layout.free, after.scores.levers, strict=False)
+    for number, free, scaled in of_numbers:
+        name, lever = number.key.split(".")[0], scaled * free.derivative(number.value)
         if name not in added or not 0 < number.sigma < math.inf:
             continue
         largest: dict[str, tuple[float, Confounder]] = {}
