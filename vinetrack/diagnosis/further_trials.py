@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import Products, products_without_trial_effects, scores_of
+from vinetrack.diagnosis.score_test import Products, products_without_trial_effects
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
@@ -36,13 +36,11 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, at_unknowns, solve_per_trial
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE
-from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.candidate_trials import (
     NEW_VINE,
     OTHER_RIG,
     SAME_RIG,
     Condition,
-    at_solution,
     blank_film,
     extended,
     extended_fit,
@@ -423,7 +421,10 @@ def further_trials(
         pairs = added_one_by_one(allowed, information, most)
         if not pairs:
             continue
-        short, with_pairs = _with_pairs(replace(tests, fit=fit), [films[k] for k in pairs], plan)
+        with_pairs = cache(partial(_with_pairs, replace(tests, fit=fit), now, [films[k] for k in pairs]))
+        short = len(pairs)  # How many of these pairs fall short of the target
+        if with_pairs(short).probability_at(value) >= target:
+            short = bisect_left(range(1, short), target, key=lambda count: with_pairs(count).probability_at(value))
         if short < len(pairs):
             # With more effort only fewer trials are worth it.
             most, needed[effort_words[effort]] = short, REPLICATES * (short + 1)
@@ -442,32 +443,9 @@ def further_trials(
 
 
 def _with_pairs(
-    tests: MisfitTests, films: Sequence[tuple[Condition, FitTrial]], plan: FurtherTrials
-) -> tuple[int, Callable[[int], EffectPower]]:
-    """How many pairs of these trials, in their order, fall short of the target, and the power with so many of them."""
-    different = list({condition.trial.name: (condition, film) for condition, film in films}.values())
-    with_all = misfit_tests(extended_fit(tests.fit, different), tests.effects, tests.level)
-    places = {trial.name: k for k, trial in enumerate(with_all.fit.trials)}
-    added = [places[condition.trial.name] for condition, _ in films for _ in range(REPLICATES)]
-
-    @cache
-    def power(pairs: int) -> EffectPower:
-        rows = [*range(len(tests.fit.trials)), *added[: REPLICATES * pairs]]
-        return effect_power(_of_trials(with_all, rows), plan.power.effect) or plan.power
-
-    def probability(pairs: int) -> float:
-        return power(pairs).probability_at(plan.value)
-
-    reached = probability(len(films)) >= plan.target
-    return bisect_left(range(1, len(films)), plan.target, key=probability) if reached else len(films), power
-
-
-def _of_trials(tests: MisfitTests, places: list[int]) -> MisfitTests:
-    """The tests of some of the trials, which may be repeated, at the same parameters."""
-    fit, rows = tests.fit, np.array(places)
-    solution = fit.solution
-    predictor, problem, (state,) = subset(fit.predictor, solution.problem, rows, solution.state, every_parameter=True)
-    columns, cross_products = tuple(solution.columns[k] for k in places), solution.cross_products[rows]
-    solution = replace(solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
-    part, products = at_solution(fit, predictor, solution), tests.products.of(places)
-    return replace(tests, fit=part, products=products, scores=scores_of(part, products))
+    tests: MisfitTests, now: EffectPower, films: Sequence[tuple[Condition, FitTrial]], count: int
+) -> EffectPower:
+    """The power for an effect with the first so many of these films made as well, each twice."""
+    made = [film for film in films[:count] for _ in range(REPLICATES)]
+    with_all = misfit_tests(extended_fit(tests.fit, made), tests.effects, tests.level)
+    return effect_power(with_all, now.effect) or now

@@ -326,11 +326,6 @@ class Products:
         """
         return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 
-    def of(self, places: Sequence[int]) -> Products:
-        """The same for some of the trials, which may be repeated."""
-        columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
-        return replace(self, columns=columns, data=data, problem=self.problem.of_trials(list(places)))
-
     @cached_property
     def _all_cross_products(self) -> Floats:
         return self._cross_products_of(self.parts[0])

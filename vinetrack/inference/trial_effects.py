@@ -89,13 +89,13 @@ Indices = NDArray[np.int_]
 
 
 def subset(
-    predictor: Predictor, problem: MixedProblem, rows: Indices, *states: FitState, every_parameter: bool = False
+    predictor: Predictor, problem: MixedProblem, rows: Indices, *states: FitState
 ) -> tuple[Predictor, MixedProblem, list[FitState]]:
     """Predictor, with the finite-difference steps of the other, problem and states of some trials and of the parameters
-    that apply to one of them, or of every parameter; names, scales and priors are unchanged.
+    that apply to one of them; names, scales and priors are unchanged.
     """
     whole = predictor.layout
-    places = np.arange(len(whole.free)) if every_parameter else np.unique(whole.index[rows])
+    places = np.unique(whole.index[rows])
     places = places[places >= 0]
     new_index = np.full(len(whole.free) + 1, -1)
     new_index[places] = np.arange(places.size)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.diagnosis.result import Diagnosis, Round
-from vinetrack.narrative.verdict_text import estimates_text, listed_names
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.narrative.verdict_text import listed_names
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_result, table_of
 
 if TYPE_CHECKING:
@@ -44,20 +44,13 @@ class DiagnosisTables:
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
+        self.ranking = diagnosis.candidates() if diagnosis else none
         self.rounds: list[tuple[str, pd.DataFrame]] = []
         for i, ranked in enumerate(rounds):
             more = [name for name in ranked.model if name not in rounds[0].model]
             heading = f"Which is missing with {listed_names(more)} added?"
             heading = heading if i else "Which effect is missing from the initial model?"
-            self.rounds.append((heading, ranking_table(ranked)))
-
-    @property
-    def ranking(self) -> pd.DataFrame:
-        """The rankings of all rounds in one table."""
-        import pandas as pd
-
-        parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(self.rounds) if len(table)]
-        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+            self.rounds.append((heading, self.ranking[self.ranking["round"] == i + 1]))
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
@@ -124,11 +117,3 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
     columns = ["condition", *names, *parts, "misfit_m", "scatter_m"]
     place = {condition: i for i, condition in enumerate(labels)}
     return table.dropna(subset=list(names))[columns].sort_values("condition", key=lambda c: c.map(place), kind="stable")
-
-
-def ranking_table(ranked: Round) -> pd.DataFrame:
-    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN."""
-    import pandas as pd
-
-    columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
-    return pd.DataFrame([vars(c) | {"size": estimates_text(c)} for c in ranked.ranking], columns=columns)
