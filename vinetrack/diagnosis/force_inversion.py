@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, replicate_scatter, residual_courses
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials, replicate_scatter, residual_courses
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import simulate_many
@@ -328,7 +328,7 @@ class ForceProblem:
 
     def __init__(self, fit: Fit) -> None:
         self.fit, self.data = fit, fit.predictor.data
-        self.scatter = replicate_scatter(fit, residual_courses(fit)[0])
+        self.scatter = replicate_scatter(fit, residual_courses(align_trials(fit)))
         self.prior = fit.solution.problem
         self.rho = track_correlation(self.data)
         noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - self.rho**2)

@@ -25,6 +25,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import (
     AlignedTrials,
     Replicates,
+    align_trials,
     by_condition,
     expected_error,
     first_that_counts,
@@ -135,12 +136,13 @@ def compare(
     """Compare a fitted model with the trials of an experiment."""
     import pandas as pd
 
-    courses, predicted, aligned = residual_courses(fit)
+    aligned = align_trials(fit)
+    courses = residual_courses(aligned)
     scatter, of_condition = replicate_scatter(fit, courses), by_condition(courses)
     measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
-    final = _final_speed_errors(aligned, predicted, measured, kinematics or {}, final_at_fraction)
+    final = _final_speed_errors(aligned, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
-    for condition, together in replicates_by_condition(predicted).items():
+    for condition, together in replicates_by_condition(aligned.trials).items():
         known = [final[trial.name] for trial in together.trials if math.isfinite(final[trial.name])]
         rows.append(
             {
@@ -152,7 +154,7 @@ def compare(
             }
         )
         trajectories[condition] = together.frames
-    return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(predicted))
+    return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(aligned.trials))
 
 
 def rms_of(trials: Iterable[TrialFit]) -> float:
@@ -184,7 +186,6 @@ def position_errors(together: Replicates) -> dict[str, float]:
 
 def _final_speed_errors(
     aligned: AlignedTrials,
-    predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
     kinematics: Mapping[str, Kinematics],
     at_fraction: float,
@@ -194,10 +195,11 @@ def _final_speed_errors(
     """
     # 3.0: duration of the simulation, in durations of the recording, so that a slow model reaches the same
     # position (chosen)
-    times_s = [t.release_s + 3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    trials = aligned.trials
+    times_s = [t.release_s + 3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in trials]
     runs = aligned.predictor.run(aligned.predictor.jobs(np.empty(0), aligned.trial_effects), times_s)
     errors = {}
-    for trial, time_s, run in zip(predicted, times_s, runs, strict=True):
+    for trial, time_s, run in zip(trials, times_s, runs, strict=True):
         motion = kinematics.get(trial.name) or estimate_kinematics(
             tracks[trial.name], travel_ratio=trial.trial.travel_ratio
         )
@@ -260,7 +262,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
     floor_m = inside[0].floor_m
-    courses, *_ = residual_courses(fits[0])
+    courses = residual_courses(align_trials(fits[0]))
     expected = expected_error(courses, replicate_scatter(fits[0], courses))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)

@@ -94,14 +94,15 @@ def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails."""
     import pandas as pd
 
-    courses, predicted, _ = residual_courses(fit)
-    scatter, together = replicate_scatter(fit, courses), replicates_by_condition(predicted)
+    aligned = align_trials(fit)
+    courses = residual_courses(aligned)
+    scatter, together = replicate_scatter(fit, courses), replicates_by_condition(aligned.trials)
     rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in by_condition(courses).items()]
     return Failure(
-        pressure_unit=predicted[0].trial.pressure_unit,
+        pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_position=_residual_along_growth(courses, scatter),
-        drift=drift(fit),
+        drift=drift(fit, aligned),
     )
 
 
@@ -216,13 +217,13 @@ class Drift:
         return tuple(significant["sentence"])
 
 
-def drift(fit: Fit) -> Drift:
+def drift(fit: Fit, aligned: AlignedTrials | None = None) -> Drift:
     """Test B for drift with pressure, payload, angle, chamber or inlet, and P_y against the sheet."""
     import pandas as pd
 
     tests = list(against_the_sheet(fit))
     if DAMPING in fit.predictor.layout.keys:
-        estimates = per_trial_estimates(fit, align_trials(fit))
+        estimates = per_trial_estimates(fit, aligned or align_trials(fit))
         tests = [*(test for against in COVARIATES for test in _against(estimates, against)), *tests]
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     table = pd.DataFrame(tests, columns=[*DRIFT_COLUMNS, "p", "groups"]).sort_values(

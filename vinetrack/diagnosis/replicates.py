@@ -31,7 +31,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
 )
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is_seen
+from vinetrack.inference.fit import aligned_to_trials, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
@@ -281,12 +281,13 @@ LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
 @dataclass(frozen=True)
 class AlignedTrials:
     """A fitted model aligned with its trials: each has its own release and origin, but no deviation of pressure or B.
-    `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`.
+    `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`; `trials` are those predicted.
     """
 
     predictor: Predictor
     trial_effects: Floats
     columns: tuple[Floats, ...]
+    trials: Sequence[TrialFit]
 
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""
@@ -295,8 +296,8 @@ class AlignedTrials:
 
 def align_trials(fit: Fit) -> AlignedTrials:
     """Align the model with the trials that it was fitted to, by release and origin."""
-    predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
-    return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
+    predictor, trial_effects, trials = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
+    return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)), trials)
 
 
 def orthogonal_part(columns: Floats, others: Floats) -> Floats:
@@ -338,11 +339,9 @@ class ResidualCourse:
         return np.asarray(np.diag(self.noise_m2 / np.maximum(count, 1.0)) + self.origin_m2)
 
 
-def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], list[TrialFit], AlignedTrials]:
-    """Courses of the trials of a fit, and the trials as predicted with their own release and origin."""
-    predicted = predict_prepared(fit, fit.predictor.data, from_rest=True)
-    aligned = align_trials(fit)
-    return [_course(aligned, *of_trial) for of_trial in enumerate(predicted)], predicted, aligned
+def residual_courses(aligned: AlignedTrials) -> list[ResidualCourse]:
+    """Courses of the trials of a fit."""
+    return [_course(aligned, *of_trial) for of_trial in enumerate(aligned.trials)]
 
 
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:

@@ -320,9 +320,7 @@ FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to hal
 
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
     """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
-    rho = 0.0 if from_rest else fit.noise_correlation
-    predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
-    return _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
+    return aligned_to_trials(fit, data, from_rest=from_rest)[2]
 
 
 def predict_from_rest(model: Model, data: Sequence[FitTrial], host: Model) -> list[TrialFit]:
@@ -347,11 +345,15 @@ def _predicted(
     ]
 
 
-def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
-    """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and whitened cross products."""
+def aligned_to_trials(
+    fit: Fit, data: Sequence[FitTrial], *, from_rest: bool
+) -> tuple[Predictor, Floats, list[TrialFit]]:
+    """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and the trials as predicted."""
     data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
     rho = 0.0 if from_rest else fit.noise_correlation
-    return _aligned(fit.model, data, fit.predictor.host, rho, from_rest=from_rest)
+    predictor, trial_effects, square = _aligned(fit.model, data, fit.predictor.host, rho, from_rest=from_rest)
+    trials = _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
+    return predictor, trial_effects, trials
 
 
 def _aligned(
