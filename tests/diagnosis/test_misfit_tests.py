@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
-from vinetrack.diagnosis import candidate_fits, ladder, selection
+from vinetrack.diagnosis import ladder, likelihood_ratio, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis import score_test as score_test
 from vinetrack.diagnosis.selection import slack_fit
@@ -245,11 +245,11 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again():
     """Of trials whose tail rubs. Of many trials a search lets go of curves."""
     model, pairs = vt.base_model(), grown({"tail_friction.mu_w": 1.0}, seed=7270)
     fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]), profile=False)
-    light = candidate_fits.without_curves(fit)
+    light = likelihood_ratio.without_curves(fit)
     assert not light.trials
     assert relative_residual(light.predictor, light.solution) == relative_residual(fit.predictor, fit.solution)
     steps = fit.predictor.steps.copy()
-    again = candidate_fits.with_curves(light)
+    again = likelihood_ratio.with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)
     assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
     for trial, before_trial in zip(again.trials, fit.trials, strict=True):

@@ -12,9 +12,9 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.diagnosis import campaign_power, linear_power
 from vinetrack.diagnosis import further_trials as advice
-from vinetrack.diagnosis.campaign_power import planned_tests
+from vinetrack.diagnosis import linear_power
+from vinetrack.diagnosis.linear_power import planned_tests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
@@ -56,7 +56,7 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     promised = planned_tests(*design)[0].fit
     filmed = [
         vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0), profile=False)
-        for pairs in (campaign_power.filmed_again(promised, np.random.default_rng(seed)) for seed in range(12))
+        for pairs in (linear_power.filmed_again(promised, np.random.default_rng(seed)) for seed in range(12))
     ]
     sigmas = np.median([[number.sigma for number in fit.numbers] for fit in filmed], axis=0)
     # What single campaigns state scatters by 13 and 29 %, the median of twelve by half of the tolerance at most.
@@ -109,7 +109,7 @@ def test_probabilities_invert_sizes():
 
 def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():
     told = [("leak", True), ("supply_refill or leak", True), ("supply_refill", False), ("", False), None]
-    rates = campaign_power.rates_of("leak", told, 0.5, 0.9)
+    rates = linear_power.rates_of("leak", told, 0.5, 0.9)
     assert (rates.count, rates.alarms, rates.campaigns, rates.failed) == (2, 3, 4, 1)
     # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
     assert replace(rates, count=9, campaigns=10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
@@ -118,7 +118,7 @@ def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate()
 
 @pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect():
-    found = campaign_power.simulated_diagnosis(planned_tests(*planned(2, (0.002, 0.006)))[0], "leak", (0.02,), 3)
+    found = linear_power.simulated_diagnosis(planned_tests(*planned(2, (0.002, 0.006)))[0], "leak", (0.02,), 3)
     assert found is not None
     assert found[1]
 

@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.candidate_fits import full_fit
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, full_fit, likelihood_ratio
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order

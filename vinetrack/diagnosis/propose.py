@@ -23,12 +23,12 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS, STATE
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
+    CandidateFits,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,

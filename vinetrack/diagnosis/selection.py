@@ -20,23 +20,20 @@ import numpy as np
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
-from vinetrack.diagnosis.candidate_fits import (
-    MIN_SHARE_OF_BEST_GAIN,
-    CandidateFits,
-    Report,
-    drop_curves,
-    full_fit,
-    with_curves,
-)
 from vinetrack.diagnosis.likelihood_ratio import (
     OUT_OF_REACH,
+    CandidateFits,
     LikelihoodRatio,
+    Report,
     answer_set,
     best_of,
+    drop_curves,
+    full_fit,
     in_sigmas,
     likelihood_ratio,
     robust_ratio,
     sizes_of,
+    with_curves,
 )
 from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
@@ -94,7 +91,8 @@ class EffectSets:
         # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
         bases = self.of_size(size - 1)[: 3 if size == 2 else 2]
         for base in bases:
-            if base.delta_chi2 < MIN_SHARE_OF_BEST_GAIN * bases[0].delta_chi2:
+            # 0.3: share of the best set's gain from which larger ones are built on a set (chosen)
+            if base.delta_chi2 < 0.3 * bases[0].delta_chi2:
                 continue
             search = CandidateFits(self.search.tests_after(base.fit), self.search.report)
             for partner in search.fit(n_partners):

@@ -19,10 +19,15 @@ from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
-from vinetrack.diagnosis.campaign_power import fitted_tests, planned_tests, rates_of, simulated_diagnosis
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.linear_power import (
+    fitted_tests,
+    planned_tests,
+    power_of,
+    rates_of,
+    simulated_diagnosis,
+)
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
