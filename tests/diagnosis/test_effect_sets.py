@@ -21,7 +21,7 @@ TRIPLE = -1000.0
 
 
 def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> LikelihoodRatio:
-    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
+    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers, trials=NAMES)
     return LikelihoodRatio(tuple(map(find_effect, names)), fit, 0.0, 0.0, True, Remark(), inflation=inflation)
 
 
@@ -39,7 +39,7 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
 
 
 def worth_of_the_last(triple: LikelihoodRatio, sets: EffectSets) -> float:
-    return selection._worth(triple, sets.leave_out(triple, triple.effects[2]), triple.effects[2:])
+    return selection._worth(triple, sets.subset(triple, triple.effects[:2], again=True), triple.effects[2:])
 
 
 @pytest.fixture(autouse=True)

@@ -27,7 +27,13 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, PROBE_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import (
+    FALSE_ALARM_LEVEL_FIRST_ROUND,
+    PROBE_LEVEL,
+    MisfitTests,
+    exceeds_slow_errors,
+    misfit_tests,
+)
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.score_test import (
@@ -172,7 +178,7 @@ def power_of(
         numbers=_interval_widths(tests.fit),
         inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
-        wary=remark("excess_counted_as_noise") if tests.exceeds_slow_errors else Remark(),
+        wary=remark("excess_counted_as_noise") if exceeds_slow_errors(tests.fit) else Remark(),
     )
 
 

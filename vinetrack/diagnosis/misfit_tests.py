@@ -198,15 +198,16 @@ class MisfitTests:
         """Thresholds of z for the candidates, such that any exceeds its own by chance with probability `level`."""
         return family_test(self.scores.cosines, self.signs, self.products.effects, self.level)
 
-    def largest_excess(self, family: FamilyTest) -> float:
-        """Largest excess of a candidate's z over its threshold; negative where no candidate exceeds its own."""
+    def any_exceeds(self, level: float) -> bool:
+        """Whether any candidate exceeds its threshold at a level that all of them share."""
+        family = family_test(self.scores.cosines, self.signs, self.products.effects, level)
         thresholds = np.array([family.threshold(name) for name in self.products.effects])
-        return float(np.max(self.one_sided_z - thresholds, initial=-math.inf))
+        return bool(np.any(self.one_sided_z > thresholds))
 
     @property
     def rejects_model(self) -> bool:
         """Whether any test rejects the model: something is missing, in the catalogue or not."""
-        return bool(self.exceeds_slow_errors or self.largest_excess(self.family) > 0 or self.omnibus_rejects)
+        return exceeds_slow_errors(self.fit) or self.any_exceeds(self.level) or self.omnibus_rejects
 
     @property
     def omnibus_rejects(self) -> bool:
@@ -225,21 +226,10 @@ class MisfitTests:
         return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < 1e-2
 
     @cached_property
-    def rejects_at_first_round_level(self) -> bool:
-        """Whether any candidate exceeds its threshold at the level of the first round."""
-        family = family_test(self.scores.cosines, self.signs, self.products.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
-        return self.largest_excess(family) > 0
-
-    @cached_property
     def probes_reject(self) -> bool:
         """Whether a smooth force would improve the fit."""
         scores = scores_of(self.fit, products_of(self.fit, _probe_shapes(self.fit)))
         return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
-
-    @property
-    def exceeds_slow_errors(self) -> bool:
-        """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
-        return exceeds_slow_errors(self.fit)
 
     @cached_property
     def predicted_gains(self) -> Floats:

@@ -99,20 +99,15 @@ class EffectSets:
                 self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
         return self.of_size(size)
 
-    def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
-        """Fit a set without one of its members, from where the set ended; None where no fit succeeds. A fit of the
-        smaller set that is known already may have ended in a local minimum, which would make the member look needed:
-        the better of the two counts.
+    def subset(
+        self, hypothesis: LikelihoodRatio, effects: Sequence[Effect], *, again: bool = False
+    ) -> LikelihoodRatio | None:
+        """Some members of a set alone, refitted from the set unless known already; None where no fit succeeds. `again`:
+        the fit that is known may have ended in a local minimum, which would make the others look needed, and the better
+        of the two counts.
         """
-        others = tuple(other for other in hypothesis.effects if other is not effect)
-        self.search.report(f"taking out {effect.name}")
-        self._refit(hypothesis.fit, others)
-        return self.fitted.get(frozenset(other.name for other in others))
-
-    def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
-        """Some members of a set alone, refitted from the set unless known already; None where the fit fails."""
         names = frozenset(effect.name for effect in effects)
-        if names not in self.fitted:
+        if again or names not in self.fitted:
             self._refit(hypothesis.fit, effects)
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
@@ -127,7 +122,9 @@ class EffectSets:
         """Find the first member of a set whose significance given the others is too low, or not known."""
         for effect in hypothesis.effects:
             sigmas, required = 0.0, SEARCH_SIGMAS
-            if (smaller := self.leave_out(hypothesis, effect)) is not None:
+            self.search.report(f"taking out {effect.name}")
+            others = [other for other in hypothesis.effects if other is not effect]
+            if (smaller := self.subset(hypothesis, others, again=True)) is not None:
                 sigmas = _worth(hypothesis, smaller, (effect,))
                 required = max(required, self.search.tests_after(smaller.fit).family.threshold(effect.name))
             if sigmas < required:
@@ -206,7 +203,7 @@ def adequate_hypotheses(
         # first round, which rejects more readily.
         if tests is None:
             rejected[hypothesis.label] = hypothesis.reason
-        elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.rejects_at_first_round_level):
+        elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
             rejected[hypothesis.label] = MISFIT_REMAINS
         elif sets is not None and len(hypothesis.effects) > 2 and (reason := sets.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
@@ -429,7 +426,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
     if not credible or not is_significant(best_of(credible)):
         # A score that no refit confirms counts only if another test rejects the model too.
-        return nothing_found(UNEXPLAINED if tests.omnibus_rejects or tests.exceeds_slow_errors else ADEQUATE)
+        return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else ADEQUATE)
     return _effect_set_rounds(tests, search, hypotheses)
 
 
