@@ -26,7 +26,6 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials, replicate_scatter, residual_courses
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, root_of_covariance, splines, whiten
@@ -103,35 +102,29 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     """Simulate the fitted motions with given trial effects. Shapes: trial_effects (n_trials, 4)."""
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta, trial_effects)
-    simulated = [_of_job(fit.model, data.trial, job) for data, job in zip(predictor.data, jobs, strict=True)]
-    models, trials = zip(*simulated, strict=True)
     # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [
-        max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + 3.0 * trial_data.frame_s, 1e-6)
-        * np.linspace(0, 1, N_STEPS + 1) ** 2
-        for i, trial_data in enumerate(predictor.data)
+        max(trial_data.time_s[-1] - release_s + 3.0 * trial_data.frame_s, 1e-6) * np.linspace(0, 1, N_STEPS + 1) ** 2
+        for trial_data, release_s in zip(predictor.data, jobs.release_s, strict=True)
     ]
-    traces = [
-        None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
-        for trial_data, job in zip(predictor.data, jobs, strict=True)
-    ]
-    runs = simulate_many(fit.model, trials, grids, traces=traces, parameters=jobs.row, host=predictor.host)
+    runs = predictor.run(jobs, [grid + release_s for grid, release_s in zip(grids, jobs.release_s, strict=True)])
     motions = []
-    for model, trial, run, trace in zip(models, trials, runs, traces, strict=True):
+    for trial_data, job, time_s, run in zip(predictor.data, jobs, grids, runs, strict=True):
+        model, trial = _of_job(fit.model, trial_data.trial, job)
         y, v = run.lead_position_m, run.lead_velocity_m_s
-        measured = None if trace is None else np.interp(run.time_s, *trace)
+        measured = None if trial_data.trace is None else np.interp(time_s + job.release_s, *trial_data.trace)
         if measured is None and any("chamber_rate" in effect.functions for effect in model):
             # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher
             # order.
-            measured = evaluate(model, trial, run.time_s, y, v).pressure_Pa
+            measured = evaluate(model, trial, time_s, y, v).pressure_Pa
         # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
-        velocity = np.gradient(y, run.time_s)
+        velocity = np.gradient(y, time_s)
         moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
-        by_time = np.gradient(run.observed_position_m, run.time_s)
+        by_time = np.gradient(run.observed_position_m, time_s)
         slope, nothing = np.where(moving, by_time / np.where(moving, velocity, 1.0), 1.0), np.zeros_like(y)
         offset_m, terms = run.observed_position_m - y, [nothing] * 5  # Terms are evaluated next
         motion = with_terms(
-            FittedMotion(trial, model, measured, run.time_s, y, v, nothing, slope, offset_m, math.inf, *terms)
+            FittedMotion(trial, model, measured, time_s, y, v, nothing, slope, offset_m, math.inf, *terms)
         )
         motions.append(replace(motion, acceleration=motion.model_acceleration))
     return motions
