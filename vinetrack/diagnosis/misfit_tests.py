@@ -107,22 +107,14 @@ def _by_conditions(fit: Fit) -> list[tuple[float, bool]]:
     known = [relative for relative in stated if math.isfinite(relative)]
     # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
     pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
-    of_trials = (
-        np.array([trial.pressure_deviation for trial in fit.trials]),
-        np.log1p([trial.damping_deviation for trial in fit.trials]),
-    )
     groups = [trial.trial.condition for trial in fit.trials]
-    fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
-    return [
-        (_anova_p(deviations, groups, fitted, allowed), spread > usual)
-        for deviations, allowed, spread, usual in zip(
-            of_trials,
-            (pressure, CAREFUL_DAMPING_SCATTER),
-            fit.state.spread,
-            (CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER),
-            strict=True,
-        )
-    ]
+    fitted, (pressure_sd, damping_sd) = sum(not math.isfinite(number.bound) for number in fit.numbers), fit.state.spread
+    p_values = (
+        _anova_p(np.array([trial.pressure_deviation for trial in fit.trials]), groups, fitted, pressure),
+        _anova_p(np.log1p([trial.damping_deviation for trial in fit.trials]), groups, fitted, CAREFUL_DAMPING_SCATTER),
+    )
+    excess = pressure_sd > CAREFUL_PRESSURE_SCATTER, damping_sd > CAREFUL_DAMPING_SCATTER
+    return list(zip(p_values, excess, strict=True))
 
 
 def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
