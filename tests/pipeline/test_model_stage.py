@@ -192,7 +192,7 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypat
         asked_for.append((effect, seed))
         return ("leak", True) if effect and seed % 2 else ("", False)
 
-    monkeypatch.setattr(planning_stage, "simulated_diagnosis", answered)
+    monkeypatch.setattr(planning_stage.linear_power, "simulated_diagnosis", answered)
     nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated
     assert asked_for == [("", 1), ("", 2), ("", 3), ("leak", 1), ("leak", 2), ("leak", 3)]
     assert (nothing.count, nothing.campaigns) == (0, 3)

@@ -345,15 +345,12 @@ def _predicted(
     ]
 
 
-def aligned_to_trials(
-    fit: Fit, data: Sequence[FitTrial], *, from_rest: bool
-) -> tuple[Predictor, Floats, list[TrialFit]]:
+def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], from_rest: bool) -> tuple[Predictor, Floats, list[TrialFit]]:
     """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and the trials as predicted."""
     data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
     rho = 0.0 if from_rest else fit.noise_correlation
     predictor, trial_effects, square = _aligned(fit.model, data, fit.predictor.host, rho, from_rest=from_rest)
-    trials = _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
-    return predictor, trial_effects, trials
+    return predictor, trial_effects, _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
 
 
 def _aligned(

@@ -19,15 +19,9 @@ from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
+from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.linear_power import (
-    fitted_tests,
-    planned_tests,
-    power_of,
-    rates_of,
-    simulated_diagnosis,
-)
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
@@ -490,7 +484,7 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False)
     else:
         inputs = []
-    return *fitted_tests(fitted, candidates), inputs, limits
+    return *linear_power.fitted_tests(fitted, candidates), inputs, limits
 
 
 def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
@@ -532,7 +526,8 @@ def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
         ),
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
-    return *planned_tests(model, trials, rates, spreads, noise, settings.candidates), inputs, settings.limits
+    tests = linear_power.planned_tests(model, trials, rates, spreads, noise, settings.candidates)
+    return *tests, inputs, settings.limits
 
 
 @in_one_blas_thread
@@ -542,11 +537,11 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
         if given is None:
             campaign = _campaign_of_target(request)
         elif isinstance(given, Fit):
-            campaign = (*fitted_tests(given), [], Limits())
+            campaign = (*linear_power.fitted_tests(given), [], Limits())
         else:
             campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
         tests, not_testable, inputs, limits = campaign
-        now = power_of(tests, not_testable, inputs, nonlinear=True)
+        now = linear_power.power_of(tests, not_testable, inputs, nonlinear=True)
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, tests, now, asked)))
@@ -606,6 +601,6 @@ def _simulated_rates(
         wanted += [(entry.effect, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
     for effect, values, predicted_rate in wanted:
-        done = map_unordered(partial(simulated_diagnosis, tests, effect, values), seeds, request.jobs)
+        done = map_unordered(partial(linear_power.simulated_diagnosis, tests, effect, values), seeds, request.jobs)
         diagnoses = list(progress(done, f"campaigns with {effect or 'nothing missing'}", len(seeds)))
-        yield rates_of(effect, diagnoses, values[0], predicted_rate)
+        yield linear_power.rates_of(effect, diagnoses, values[0], predicted_rate)
