@@ -40,8 +40,7 @@ def questioned(of: Scores, level: float = FIRST, effects=()) -> MisfitTests:
     shape = SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=0))
     named = tuple(effects) or tuple(f"effect_{k}" for k in range(of.score.size))
     answers = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
-    fit = None
-    return MisfitTests(fit, (), answers, of, level)
+    return MisfitTests(None, (), answers, of, level)
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
@@ -150,14 +149,14 @@ def test_scores_that_a_specimen_shares_count_once():
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter):
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
-    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, None
+    friction, true, unit = vt.effects.tail_friction, 0.05, 300.0
     answers = score_test.Products((), (), None, 1, (score_test.CandidateShape(friction, (), 1e-3),))
     held = []
     for _ in range(2000):
         one = scores(draw, trials, 1, sizes=true * unit)
         more = scatter * np.sqrt(one.trial_informations) * draw.standard_normal((trials, 1))
         of = summed((one.trial_scores + more) * unit, one.trial_informations[:, :, None] * unit**2)
-        limits, testable = MisfitTests(fit, (friction,), answers, of, FIRST).upper_limits(friction)
+        limits, testable = MisfitTests(None, (friction,), answers, of, FIRST).upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
     assert 0.92 < np.mean(held) < 0.99
