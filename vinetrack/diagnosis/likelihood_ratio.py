@@ -186,7 +186,7 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     """Ratio of the standard error of a size from the scatter of trials to that from the noise model; at least 1. The
     largest of all these sizes.
     """
-    if not names or len(after.trials) < FEWEST_CLUSTERS:
+    if not names or len(after.predictor.data) < FEWEST_CLUSTERS:
         return 1.0
     plain, variance, _ = robust_variances(after.predictor, after.solution)
     ratios = [
