@@ -111,7 +111,7 @@ def test_frames_and_axis_of_one_trial_alone(tmp_path):
 @pytest.mark.real
 def test_either_of_two_point_masses_of_a_real_project(real):
     path = real / "falling_cups" / "cups.trk"
-    with pytest.raises(InputError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
+    with pytest.raises(InputError, match="no point named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
         read_track(path, point_mass="cup")
     third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
     # The heavier stack falls further over the same frames.

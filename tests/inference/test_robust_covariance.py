@@ -189,6 +189,16 @@ def test_the_band_of_drops_that_agree_is_their_noise():
     assert np.median(last.band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)
 
 
+def test_a_trial_that_depends_on_what_the_fit_does_not_determine_has_no_band():
+    """Friction of a payload, fitted to bare vines: a band would take what it stays at for known exactly."""
+    pairs, draw = small_campaign(4)[0], np.random.default_rng(4)
+    fit = vt.fit(vt.base_model() + "payload_friction", pairs, profile=False)
+    loaded = replace(pairs[0][0], name="loaded", payload_kg=0.06)
+    bare, heavy = vt.predict(fit, [pairs[0], (loaded, filmed(loaded, draw)[0])])
+    assert np.isfinite(bare.band_m).all()
+    assert heavy.band_m is None
+
+
 def fitted(seed: int = 1, replicates: int = 3, **changes: float) -> fit_result.Fit:
     pairs, _ = small_campaign(seed, damping=5e-3, pressure=2e-3, replicates=replicates)
     return vt.fit(vt.base_model(), [(replace(trial, **changes), track) for trial, track in pairs], profile=False)

@@ -77,15 +77,16 @@ def again(tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> list[s
 
 
 CELLS: Mapping[str, object] = {
-    "trial": "other", "track": None, "video": None, "capture_fps": 900, "exposure_us": 100, "diameter_mm": 13,
+    "track": None, "video": None, "capture_fps": 900, "exposure_us": 100, "diameter_mm": 13,
     "thickness_um": 90, "length_mm": 200, "pressure_kPa": 31, "yield_pressure_kPa": 2, "pressure_sigma_kPa": 0.2,
     "yield_pressure_sigma_kPa": 0.1, "pressure_trace": None, "payload_g": 1, "growth_angle_deg": 90, "chamber_l": 2,
     "inlet_mm": 3, "bends": "10:20:50", "film_density_kg_m3": 1100, "mm_per_px": 0.29, "travel_ratio": None,
-    "steady": "0.01:0.02", "use": "no", "specimen": "s", "day": "monday", "order": 2, "axis": "30,80:600,80",
+    "steady": "0.01:0.02", "use": "no", "axis": "30,80:600,80",
     "frames_used": "2:60", "point_mass": None, "compare_sizes": "no", "position_systematic_mm": 0.1,
     "capture_fps_is_playback": "yes",
 }  # fmt: skip
-"""A changed cell of every column; None for those that make it another kind of trial."""
+"""A changed cell of a column, else "other" or 2; None for those that make it another kind of trial."""
+CELLS = {name: CELLS.get(name, "other" if column.kind == "text" else 2) for name, column in COLUMNS.items()}
 RETRACKED = {"capture_fps", "exposure_us", "axis", "frames_used"}
 KEYS = (
     "model: [pressure_drive, gravity, eversion_damping, yield_pressure, leak]\nchamber_l: 3\n",

@@ -1,1 +1,1 @@
-"""One file a figure: a tidy table in, a matplotlib Figure out."""
+"""One function a figure: a tidy table in, a matplotlib Figure out."""

@@ -48,6 +48,7 @@ class RegisteredFigure:
 
 
 DIAGNOSIS_SECTIONS = ("verdict", "where", "candidates", "drift")
+SECTIONS = ("damping", "model", *DIAGNOSIS_SECTIONS, "paper")
 
 _registered: dict[str, RegisteredFigure] = {}
 
@@ -56,6 +57,7 @@ def figure(name: str, section: str, title: str, *, data: str = "") -> Callable[[
     """Register the decorated function as the drawing of a figure, and draw it in the common style."""
 
     def register(drawing: _Drawing) -> _Drawing:
+        assert section in SECTIONS, section
         styled = look()(drawing)
         caption = " ".join((drawing.__doc__ or "").split())
         _registered[name] = RegisteredFigure(name, section, title, caption, data, styled)

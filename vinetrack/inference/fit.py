@@ -90,13 +90,15 @@ COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
 
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
-    """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
+    """Predicted trials with the half width of their 95 % bands, None where a trial depends on a parameter that the fit
+    does not determine. Shape (n_points,).
+    """
     discrepancy, reach = _calibrated(fit)
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
             loadings, random = _loadings_of_new_trial(fit, trial_data, trial)
-        except SimulationError:
+        except (SimulationError, FitError):
             banded.append(trial)
             continue
         variance = np.sum(loadings**2, axis=1) + random + (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
@@ -209,6 +211,10 @@ def _loadings_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> t
     parameter_covariance[matched, :] = parameter_covariance[:, matched] = 0.0
     parameter_covariance[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
     design = _design_matrix(columns, layout.index[0], theta.size)
+    unknown = matched[~np.isfinite(np.diag(fit.covariance)[places[matched]])]
+    # 1e-6: part of the travel by which a trial does not depend on a parameter (derived)
+    if np.any(np.abs(design[:, unknown]) > 1e-6 * np.ptp(trial_data.lead_position_m)):
+        raise FitError("the trial depends on a parameter that the fit does not determine")
     state = fit.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]

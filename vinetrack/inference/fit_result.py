@@ -558,7 +558,7 @@ def number_row(number: Number) -> tuple[str, ...]:
 
 
 def _spread_line(name: str, spread: BetweenTrialSpread) -> str:
-    how = "" if spread.estimated else " (fixed: given, or too few trials to estimate it)"
+    how = "" if spread.estimated else " (fixed: given, too few trials to estimate it, or a poor fit)"
     return f"between-trial standard deviation of {name} {100 * spread.value:.2g} %{how}"
 
 

@@ -170,7 +170,7 @@ class VinePrediction:
         largest change first; without those whose columns are blank.
         """
         host, trial = host_for(self.inputs.model), self.inputs.trial
-        # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
+        # Radial strain of a thin-walled closed tube under hoop stress PD/2t and a quarter of it along the tube, ν = ½.
         # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
         kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
         (without,) = final_speeds(self.inputs.model, [trial], self.at_fraction, host=host).tolist()

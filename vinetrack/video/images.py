@@ -319,6 +319,11 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     return {key: (root.findtext(place) or "").strip() for key, place in places.items()}
 
 
+def inspect_camera_file(path: Path) -> Recording:
+    """Read the header of a file of a high-speed camera: a `.cine`, or a `.mraw` with a header beside it."""
+    return inspect_cine(path) if path.suffix.lower() == ".cine" else inspect_mraw(path)
+
+
 def inspect_images(path: Path) -> Recording:
     """Read the facts of a folder of images or a TIFF stack from its first picture."""
     import cv2
