@@ -378,6 +378,11 @@ def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_trave
     first, *others = prepare(stated)[0]
     assert first.position_systematic_m == 2.5e-4
     assert [each.position_systematic_m for each in others] == pytest.approx([4e-4 * longest_m] * len(others))
+    trial, track = pairs[0]
+    back = (replace(trial, name="in mm, and backwards"), replace(track, lead_position_m=-1e3 * track.lead_position_m))
+    data, left_out = prepare([*stated, back])
+    assert list(left_out) == [back[0].name]
+    assert data[-1].position_systematic_m == pytest.approx(4e-4 * longest_m)
 
 
 @pytest.mark.slow

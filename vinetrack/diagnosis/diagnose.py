@@ -20,6 +20,7 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.misfit_tests import LARGEST_MISSED
 from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -43,6 +44,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.tracks.position_noise import rejected_points_note
 
@@ -100,6 +102,10 @@ def diagnose(
 
     result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
     result = with_lost_frames(result, dropped)
+    missed = relative_residuals(fit.predictor, fit.solution)
+    far_off = [one.name for one, part in zip(fit.trials, missed, strict=True) if part > LARGEST_MISSED]
+    if 0 < len(far_off) <= len(missed) / 2:
+        result = replace(result, notes=(*result.notes, remark("far_off", names=far_off, percent=100 * missed.max())))
     if outliers_note:
         result = replace(result, notes=(*result.notes, outliers_note))
     if ladder:

@@ -458,6 +458,8 @@ class ForceEquations:
         robust = covariance @ (scores.T @ scores * clusters) @ covariance
         variance = max(float(np.trace(covariance)), float(np.trace(robust))) / change.size
         dof = float(np.trace(covariance @ information))
+        if not variance > 0:
+            raise np.linalg.LinAlgError("the positions do not determine a force")
         return ForceEstimate(float(score @ change), change, math.sqrt(variance), dof)
 
     def chi2_with(self, coefficients: Floats) -> float:

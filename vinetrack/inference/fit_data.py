@@ -144,11 +144,8 @@ def prepare_trial(
     denoised: DenoisedTrace | None = None,
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
-    longest_travel_m: float = 0.0,
 ) -> FitTrial:
-    """The data of one trial: its usable points, rest included, and the noise that they show. Where nothing knows the
-    lens, its smooth errors are a part of `longest_travel_m`.
-    """
+    """The data of one trial: its usable points, rest included, and the noise that they show."""
     fewest_moving = 4  # A trial with fewer points in motion is refused (derived)
     usable = track.usable & ~_near_end_of_growth(trial, track)
     imprecise, imprecise_rest = _imprecise_points(track, usable)
@@ -209,7 +206,7 @@ def prepare_trial(
         imprecise_rest=imprecise_rest,
         position_systematic_m=trial.position_systematic_m
         if math.isfinite(trial.position_systematic_m)
-        else SYSTEMATIC_OF_TRAVEL * max(longest_travel_m, moved_m),
+        else SYSTEMATIC_OF_TRAVEL * moved_m,
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
@@ -365,13 +362,17 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
-    seen = [track.lead_position_m[track.usable] for _, track in pairs]
-    longest_m = max((float(np.ptp(position_m)) for position_m in seen if position_m.size), default=0.0)
     for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m, longest_m))
+            data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)
+    # Where nothing knows the lens, its smooth errors are a part of the longest travel of the trials that are fitted.
+    seen = [track.lead_position_m[track.usable] for trial, track in pairs if trial.name not in left_out]
+    lens_m = SYSTEMATIC_OF_TRAVEL * max((float(np.ptp(position_m)) for position_m in seen), default=0.0)
+    for i, one in enumerate(data):
+        if not math.isfinite(one.trial.position_systematic_m):
+            data[i] = replace(one, position_systematic_m=max(one.position_systematic_m, lens_m))
     return _with_weighted_points(data) if weighted else data, left_out
 
 

@@ -156,16 +156,17 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
     is far above its noise, but no reason to try other starts.
     """
     # 3e-3: residual of the median trial, relative to its growth, above which a fit is poor (chosen)
-    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > 3e-3)
+    missed = float(np.median(relative_residuals(predictor, solution)))
+    return chi2_per_dof(predictor, solution) > POOR_FIT and missed > 3e-3
 
 
-def relative_residual(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square residual of the median trial, relative to its observed growth."""
+def relative_residuals(predictor: Predictor, solution: Solution) -> Floats:
+    """Root mean square residual of each trial, relative to its observed growth, shape (n_trials,)."""
     relative = [
         math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
         for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
     ]
-    return float(np.median(relative))
+    return np.array(relative)
 
 
 MOST_ITERATIONS = 60  # Maximum number of steps (chosen)

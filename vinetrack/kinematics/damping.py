@@ -103,7 +103,7 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     methods = {"log_log": False, "both_axes": True}
     if kept.empty:
         reasons = "; ".join(f"{vine}: {why}" for vine, why in left_out.items())
-        reason = reasons or "there is no trial with a steady window"
+        reason = reasons or "that of each trial is in damping_points.csv"
         refused = f"no vine has enough steady trials for a slope ({reason})"
         return {method: _refusal(refused, left_out) for method in methods}
     data, vines = _logarithms(kept), kept.groupby("vine", sort=False).first()
