@@ -39,11 +39,11 @@ BUDGETS = {
     "narrative": (1118, 3, 9),
     "pages": (2874, 8, 22),
     "paper": (891, 4, 35),
-    "pipeline": (1999, 7, 6),
+    "pipeline": (2000, 7, 6),
     "planning": (1589, 5, 24),
     "report": (888, 3, 6),
     "results": (485, 4, 10),
-    "tracks": (1482, 4, 20),
+    "tracks": (1487, 4, 20),
     "video": (5435, 17, 79),
 }
 """Lines, files and module-level constants that a room may have, lowered with the code; what moves to another room takes

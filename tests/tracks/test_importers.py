@@ -120,6 +120,7 @@ FOREIGN = {
     + "".join(f"{i / FPS:.4f} {x} {y}\n" for i, (x, y) in enumerate(PIXELS)),
     "DLTdv": "pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y\nNaN,NaN,NaN,NaN\n"
     + "".join(f"{x},{y},NaN,NaN\n" for x, y in PIXELS),
+    "pixels by name": "t,x (px),y (px)\n" + "".join(f"{i / FPS},{x},{y}\n" for i, (x, y) in enumerate(PIXELS)),
     "DLTdv in space": "pt1_X,pt1_Y,pt1_Z\n" + "".join(f"{0.6 * x},{y},{0.8 * x}\n" for x, y in PIXELS),
 }
 
@@ -133,11 +134,19 @@ def test_a_table_of_another_program_is_read_with_rate_and_scale_of_the_sheet(tmp
     np.testing.assert_allclose(np.diff(track.time_s), 1 / FPS, atol=1e-9)
     np.testing.assert_allclose(np.ptp(track.lead_position_m[found]), np.ptp(GROWN_M), rtol=1e-5)
     np.testing.assert_allclose(np.diff(track.lead_position_m[found]), np.diff(GROWN_M), atol=1e-9)
-    if "Kinovea" not in name:
+    if "Kinovea" not in name and name != "pixels by name":
         with pytest.raises(InputError, match="capture_fps"):
             read_track(path)
     with pytest.raises(InputError):
         read_track(path, point_mass="toe", **SHEET)
+
+
+def test_times_of_a_clock_are_refused_and_a_particle_has_its_number_as_name(tmp_path):
+    clock = "#Kinovea Trajectory data export\n#T X Y\n\n# tip\n" + "".join(f"0:00:00:{i:02} {i} 0\n" for i in range(9))
+    with pytest.raises(InputError, match="in seconds"):
+        read_track(write(tmp_path, clock), **SHEET)
+    floats = FOREIGN["trackpy"].replace(",3\n", ",3.0\n")
+    assert read_track(write(tmp_path, floats), point_mass="3", **SHEET).usable.sum() == len(PIXELS)
 
 
 def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path):

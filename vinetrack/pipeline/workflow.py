@@ -53,7 +53,8 @@ def command_for_results(experiment: Path, results: Path) -> str:
     """Return the command that writes the results of an experiment to the folder where they are."""
     name, where = experiment.absolute().name, results.absolute()
     if where.name != name:
-        return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
+        chain = ["snakemake", "--snakefile", str(PACKAGE / "pipeline" / "Snakefile"), "--cores", "2", "--config"]
+        return shlex.join([*chain, f"experiment={experiment}", f"results={results}"])
     command = ["vinetrack", "run", str(experiment)]
     usual = where.parent == Path("results").absolute()
     return shlex.join(command if usual else [*command, "--results", os.path.relpath(where.parent)])

@@ -328,7 +328,10 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
         of, quantity, unit = _column(column)
         if quantity:
             columns.setdefault("clock" if quantity in ("t", "frame") else of, {}).setdefault(quantity, (column, unit))
-    clock, particle = columns.pop("clock", {}), np.array([row.get("particle", "") for row in table.rows])
+    clock, particle = (
+        columns.pop("clock", {}),
+        np.array([row.get("particle", "").removesuffix(".0") for row in table.rows]),
+    )
     points = {}
     for of, given in columns.items():
         if not (axes := [given[axis] for axis in "xyz" if axis in given]):
@@ -343,6 +346,8 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
     axes, rows, places = points[name]
 
     column, time_unit = clock.get("t") or clock.get("frame") or ("the rows", "frames")
+    if any(":" in row.get(column, "") for row in table.rows):
+        raise InputError("holds times of a clock", "export them in seconds or milliseconds")
     time = table.numbers(column)[rows] if clock else rows.astype(float)
     factors = {"seconds": 1.0, "milliseconds": 1e-3, "frames": 1 / capture_fps}
     if "t" not in clock:
@@ -357,9 +362,9 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
     check_times(time_s, [table.lines[row] for row in rows])
 
     unit, scale = axes[0][1], m_per_px
-    if unit:
+    if unit and unit.lower() not in ("px", "pixel", "pixels"):
         scale = _factor(unit, "m")
-    elif ("t" in clock or len(axes) == 3) and not (name and math.isfinite(m_per_px)):
+    elif not unit and ("t" in clock or len(axes) == 3) and not (name and math.isfinite(m_per_px)):
         unit, scale = "metres", 1.0
     elif not math.isfinite(m_per_px):
         raise InputError("has its places in pixels", "give the length of a pixel as mm_per_px")
