@@ -130,6 +130,14 @@ def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10
     return write(folder, f"{HEADER}{columns}\n" + "\n".join(lines) + "\n")
 
 
+def test_times_in_milliseconds_are_asked_about(tmp_path):
+    written(tmp_path)
+    for factor, codes in ((1.0, []), (1e3, ["times"] * 10)):
+        lines = [f"{factor * i / 1069},{1e-5 * i**2}" for i in range(60)]
+        (tmp_path / "a.csv").write_text("time_s,position_m\n" + "\n".join(lines) + "\n")
+        assert [problem.code for problem in folder.check_experiment(tmp_path) if problem.trial] == codes
+
+
 def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path):
     cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
     trials = folder.read_experiment(written(tmp_path, ",specimen,day,order", cells)).trials
