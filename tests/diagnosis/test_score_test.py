@@ -188,7 +188,7 @@ def number_of(key: str, value: float, sigma: float) -> fit_result.Number:
 def known_fit(log_likelihood: float, *numbers: fit_result.Number):
     """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
     known = {"covariance": np.diag([number.sigma**2 for number in numbers]), "trials": (), "model": ("film_mass",)}
-    return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
+    return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, predictor=SimpleNamespace(data=()), **known)
 
 
 def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> ratios.LikelihoodRatio:
@@ -214,7 +214,7 @@ def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(val
 def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(ratio, inflation, monkeypatch):
     """What trials scatter more than the noise says is taken off; as a variance it counts six times at most."""
     after = known_fit(-100.0, number_of("air_drag.C_D", 1.0, 0.1))
-    after.trials, after.predictor, after.solution = (None,) * 12, None, None
+    after.predictor, after.solution = SimpleNamespace(data=(None,) * 12), None
     scattered = (np.diag([0.01]), np.array([0.01 * ratio**2]), np.array([5.0]))
     monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_variances", lambda *_: scattered)
     found = ratios.likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
