@@ -26,29 +26,29 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (698, 4, 5),
-    "core": (955, 7, 26),
+    "core": (956, 7, 26),
     "diagnosis": (6701, 18, 93),
     "dynamics": (2318, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
-    "figures": (1996, 8, 35),
-    "inference": (5716, 14, 51),
+    "figures": (1996, 8, 34),
+    "inference": (5714, 14, 51),
     "interface": (599, 2, 2),
     "kinematics": (1721, 6, 12),
     "laboratory": (1600, 6, 9),
     "narrative": (1118, 3, 9),
     "pages": (2874, 8, 22),
     "paper": (891, 4, 35),
-    "pipeline": (2000, 7, 6),
+    "pipeline": (1999, 7, 6),
     "planning": (1589, 5, 24),
     "report": (888, 3, 6),
     "results": (485, 4, 10),
     "tracks": (1487, 4, 20),
-    "video": (5435, 17, 79),
+    "video": (5434, 17, 80),
 }
 """Lines, files and module-level constants that a room may have, lowered with the code; what moves to another room takes
 its own along. The files of single effects do not count: a new effect is free."""
-LET_PASS = (10, 0, 1)  # A column or a figure more is let pass: who adds it need not take out what he has not read
+LET_PASS = (30, 0, 2)  # A figure or a format more is let pass: who adds it need not take out what he has not read
 
 HEAVY = {"matplotlib", "cv2", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
 HEAVY_AT_IMPORT = {

@@ -193,7 +193,7 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
 
 MIXTURE_TIMES = np.linspace(0.0, 0.3, 200)
 DRAWN_LAST = ("film_mass", "payload_mass")
-"""Effects that came after the seeds: the others keep the sizes that these seeds always gave them."""
+"""Effects that came after the seeds, in the order in which they came: the others keep the sizes that they always had."""
 
 
 def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
@@ -202,7 +202,8 @@ def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
     payload, down = float(rng.choice([0.0, 35.6e-3])), float(rng.choice([1.0, 0.0, -1.0]))
     vine = Vine(D=D, t=1e-4, L=L, P=P, P_y=3e3, B=B, payload=payload, down=down)
     sizes = {"eversion_damping.B": vine.B, "eversion_damping.n": N}
-    for effect in sorted(catalogue().values(), key=lambda effect: effect.name in DRAWN_LAST):
+    came = {name: place for place, name in enumerate(DRAWN_LAST, 1)}
+    for effect in sorted(catalogue().values(), key=lambda effect: came.get(effect.name, 0)):
         if effect.kind != "base" and rng.random() < 0.4:
             sizes |= {f"{effect.name}.{p.name}": rng.uniform(*p.plausible) for p in effect.parameters}
     return vine, sizes

@@ -28,7 +28,8 @@ FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "correct
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 
 SIDE_FILES = (".cih", ".cihx")  # Suffixes of headers that lie beside a Photron `.mraw`
-CAMERA_FILES = frozenset({".cine", ".mraw", *SIDE_FILES})  # Those of high-speed cameras, which state the capture rate
+# Suffixes of files of high-speed cameras, which state the capture rate
+CAMERA_FILES = frozenset({".cine", ".mraw", *SIDE_FILES})
 # Suffixes of recordings: films, and pictures of which a folder or a stack is one
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts"}) | CAMERA_FILES - {*SIDE_FILES}
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})

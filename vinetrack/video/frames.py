@@ -281,14 +281,14 @@ def inspect_recording(path: Path | str) -> Recording:
         raise RecordingError("there is no such file or folder", name=path.name) from None
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", name=path.name) from None
-    from vinetrack.video.images import inspect_camera_file, inspect_images
+    from vinetrack.video.images import CAMERA_READERS, inspect_images
 
     if path.is_dir() or path.suffix.lower() in IMAGES:
         return inspect_images(path)
     if size == 0:
         raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     if path.suffix.lower() in CAMERA_FILES:
-        return inspect_camera_file(path)
+        return CAMERA_READERS[path.suffix.lower()](path)
     return _inspect_container(path)
 
 

@@ -319,9 +319,8 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     return {key: (root.findtext(place) or "").strip() for key, place in places.items()}
 
 
-def inspect_camera_file(path: Path) -> Recording:
-    """Read the header of a file of a high-speed camera: a `.cine`, or a `.mraw` with a header beside it."""
-    return inspect_cine(path) if path.suffix.lower() == ".cine" else inspect_mraw(path)
+# Readers of the headers of files of high-speed cameras, by suffix
+CAMERA_READERS = {".cine": inspect_cine} | dict.fromkeys((".mraw", *SIDE_FILES), inspect_mraw)
 
 
 def inspect_images(path: Path) -> Recording:
