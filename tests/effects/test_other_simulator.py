@@ -193,7 +193,7 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
 
 MIXTURE_TIMES = np.linspace(0.0, 0.3, 200)
 DRAWN_LAST = ("film_mass", "payload_mass")
-"""Effects that came after the seeds, in the order in which they came: the others keep the sizes that they always had."""
+"""Effects that came after the seeds, in the order in which they came: the others keep their sizes."""
 
 
 def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
