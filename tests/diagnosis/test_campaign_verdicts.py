@@ -38,7 +38,7 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import group_names, groups_of, make_layout
-from vinetrack.inference.optimiser import variance_floor
+from vinetrack.inference.optimiser import relative_residuals, variance_floor
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign
 from vinetrack.tracks.importers import flag_end_of_motion
@@ -329,6 +329,14 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     first, last = (depleted.ladder.iloc[k] for k in range(2))
     assert last["rms_left_out_m"] < 0.5 * first["rms_left_out_m"]
     assert last["rms_in_sample_m"] < 2 * last["floor_m"]
+
+
+def test_trials_that_only_the_initial_model_misses_by_far_are_no_reason_to_look_at_their_rows(depleted, monkeypatch):
+    of_initial, of_final = (np.median(relative_residuals(fit.predictor, fit.solution)) for fit in depleted.fits)
+    for limit, told in ((of_initial, False), (of_final, True)):
+        monkeypatch.setattr("vinetrack.diagnosis.diagnose.LARGEST_MISSED", limit)
+        again = vt.diagnose(depleted.fits[0], ladder=False, advice=False)
+        assert ("far_off" in [note.code for note in again.notes]) == told
 
 
 def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted):

@@ -102,8 +102,9 @@ def diagnose(
 
     result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
     result = with_lost_frames(result, dropped)
-    missed = relative_residuals(fit.predictor, fit.solution)
-    far_off = [one.name for one, part in zip(fit.trials, missed, strict=True) if part > LARGEST_MISSED]
+    missed = relative_residuals(result.fits[-1].predictor, result.fits[-1].solution)
+    data = result.fits[-1].predictor.data
+    far_off = [one.trial.name for one, part in zip(data, missed, strict=True) if part > LARGEST_MISSED]
     if 0 < len(far_off) <= len(missed) / 2:
         result = replace(result, notes=(*result.notes, remark("far_off", names=far_off, percent=100 * missed.max())))
     if outliers_note:

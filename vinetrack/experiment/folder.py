@@ -488,10 +488,9 @@ def _check_track(trial: Trial) -> list[Problem]:
         return [Problem.from_error(error, SHEET, **place)]
     remarks = {}
     step_s = float(np.median(np.diff(track.time_s)))
-    frames = step_s * trial.capture_fps
     if step_s > 0.2:  # no camera that films a growth takes so few pictures (chosen)
         remarks["times"] = f"has points {step_s:.3g} s apart: are its times in seconds?"
-    elif abs(frames - 1) > 0.02:
+    elif abs((frames := step_s * trial.capture_fps) - 1) > 0.02:
         remarks["capture_fps"] = f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?"
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
     # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
