@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from grown import grown, pairs_of
+from hidden_truth import grown as hidden
 from hidden_truth import sheet
 from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, as_track, filmed, grown_position, small_campaign, vine_trial
 from vine_truth import Vine, record
@@ -103,6 +104,25 @@ def test_a_refit_stays_at_the_solution_or_comes_back_to_it_and_falls_off_where_a
     assert [number.key for number in held.numbers if number.symbol == "n"] == []
     # Three standard errors away: −2 ln L rises by 9 where all is linear.
     assert 2 * (fit.log_likelihood - held.log_likelihood) == pytest.approx(9, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all_does(monkeypatch):
+    """A supply that empties, hidden in 64 trials of two vines; the model without it is far off."""
+    trials = sheet(payload_g=2.0)
+    trials = [replace(one, name=f"{one.name}_{k}") for k in range(-(-64 // len(trials))) for one in trials][:64]
+    pairs = hidden({"reservoir_depletion.gamma": 1.2}, seed=5, trials=trials)
+    fits = []
+    for some in (True, False):
+        if not some:
+            monkeypatch.setattr(solving, "_part", lambda _: np.zeros(0, dtype=int))
+        base = vt.fit(vt.base_model(), pairs, profile=False)
+        fits.append((base, vt.refit(base, base.model + "reservoir_depletion")))
+    (base, fit), (_, reference) = fits
+    assert base.chi2_per_dof > 100 and fit.chi2_per_dof < 1.2
+    assert abs(fit.log_likelihood - reference.log_likelihood) < 0.02
+    for number, other in zip(fit.numbers, reference.numbers, strict=True):
+        assert abs(number.value - other.value) < 0.05 * other.sigma
 
 
 def test_one_B_for_all_vines_if_requested_and_two_yield_pressures_where_two_are_stated(campaign):

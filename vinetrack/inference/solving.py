@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
@@ -63,7 +64,10 @@ from vinetrack.inference.sensitivity import (
     align,
     candidates,
 )
-from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset, trial_costs
+
+
+ALIKE = (5e-4, 1e-3)  # Between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
 
 
 def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None) -> Solution:
@@ -88,8 +92,41 @@ def solve_from(
     """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`;
     `how` are options of `_solve_or_alike`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
-    state = first_state(predictor.data, theta, trial_effects)
-    return _solve_or_alike(predictor, make_problem(predictor, trial_effects), state, fixed_terms, **how)
+    problem, state = make_problem(predictor, trial_effects), first_state(predictor.data, theta, trial_effects)
+    if (rows := _part(predictor)).size:
+        state, poor = _solved_for_part(predictor, problem, state, fixed_terms, rows, **how)
+        if poor:  # It only has to be ruled out.
+            # 4: steps with all trials of a fit that is poor with some of them (chosen)
+            fixed_terms, how = replace(fixed_terms, spread=ALIKE), how | {"most_iterations": 4}
+    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
+
+
+def _part(predictor: Predictor) -> NDArray[np.int_]:
+    """Rows of the trials with which a fit of many begins, evenly spaced by vine; none where there are few."""
+    # 24, 2: trials with which a fit of at least twice as many begins, or this many per parameter (chosen)
+    count, vines = max(24, 2 * len(predictor.layout.free)), [one.trial.vine for one in predictor.data]
+    if len(vines) < 2 * count:
+        return np.zeros(0, dtype=int)
+    return np.sort(np.argsort(vines, kind="stable")[np.linspace(0, len(vines) - 1, count).round().astype(int)])
+
+
+def _solved_for_part(
+    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, rows: NDArray[np.int_],
+    **how: Any,
+) -> tuple[FitState, bool]:  # fmt: skip
+    """The state of all trials from where a fit to some of them ends, and whether that is poor. Most steps of a fit lead
+    to the parameters, which need few trials.
+    """
+    if (noise := fixed_terms.noise) is not None:
+        fixed_terms = replace(fixed_terms, noise=(noise[0], noise[1][rows]))
+    part, problem, (start,) = subset(predictor, problem, rows, state)
+    solution = _solve_or_alike(part, problem, start, fixed_terms, **how)
+    theta, reached = state.theta.copy(), solution.state
+    theta[np.unique(predictor.layout.index[rows][predictor.layout.index[rows] >= 0])] = reached.theta
+    effects, _ = align(predictor.data, predictor, theta, state.trial_effects)
+    effects[rows] = reached.trial_effects
+    reached = FitState(theta, effects, reached.spread, reached.rho, state.variance)
+    return reached, is_poor_fit(part, solution)
 
 
 def _solve_or_alike(
@@ -108,9 +145,8 @@ def _solve_or_alike(
     solution = solve(predictor, problem, state, fixed_terms, **how)
     if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
         return solution
-    # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
     try:
-        alike = solve(predictor, problem, state, replace(fixed_terms, spread=(5e-4, 1e-3)), **how)
+        alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
         solution = solve(predictor, problem, alike.state, fixed_terms, **how)
         return alike if is_poor_fit(predictor, solution) else solution
     except SimulationError:
