@@ -119,7 +119,8 @@ def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all
         base = vt.fit(vt.base_model(), pairs, profile=False)
         fits.append((base, vt.refit(base, base.model + "reservoir_depletion")))
     (base, fit), (_, reference) = fits
-    assert base.chi2_per_dof > 100 and fit.chi2_per_dof < 1.2
+    assert base.chi2_per_dof > 100
+    assert fit.chi2_per_dof < 1.2
     assert abs(fit.log_likelihood - reference.log_likelihood) < 0.02
     for number, other in zip(fit.numbers, reference.numbers, strict=True):
         assert abs(number.value - other.value) < 0.05 * other.sigma

@@ -66,7 +66,6 @@ from vinetrack.inference.sensitivity import (
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset, trial_costs
 
-
 ALIKE = (5e-4, 1e-3)  # Between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
 
 
