@@ -7,7 +7,7 @@ likelihood compares hypotheses without crediting any of them with what such an e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,7 +23,6 @@ from vinetrack.inference.marginal_likelihood import (
     Marginal,
     MixedProblem,
     at_unknowns,
-    deviance,
     inverse_of_block,
     levenberg_marquardt_step,
     log_likelihood,
@@ -46,17 +45,14 @@ from vinetrack.inference.systematics import systematics_of
 # ------------------------------------------------------------------------------
 # Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
 #
-# The covariance is the inverse information of the linearised mixed model. As between-trial standard deviations are
-# estimated from a few trials, 95 % intervals use Student's t with Satterthwaite degrees of freedom (Giesbrecht &
-# Burns, Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the
-# profile likelihood: the values that a constrained fit does not reject.
+# The covariance is the inverse information of the linearised mixed model, widened by the scatter of trials, with its
+# degrees of freedom. Near a bound, where a linear interval is invalid, the interval is that of the profile likelihood:
+# the values that a constrained fit does not reject.
 
 
 LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence on the trajectories (chosen)
 
 NEAR_BOUND_SIGMAS = 3.5  # Standard errors from a bound within which the interval is a profile interval
-
-LOG_STEP = 0.1  # Step of derivatives in the logarithm of a positive number (chosen)
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ def precision(solution: Solution) -> Precision:
     """Covariance at the end of a fit, from the model of noise and between-trial variation."""
     part = marginal(solution.cross_products, solution.problem, solution.state)
     covariance, insensitive, collinear = _covariance(part, solution.problem, solution.state, solution.state.spread)
-    return Precision(covariance, degrees_of_freedom(solution), insensitive, collinear)
+    return Precision(covariance, np.full(len(covariance), math.inf), insensitive, collinear)
 
 
 def _covariance(
@@ -110,63 +106,6 @@ def _covariance(
     unknown = np.flatnonzero(insensitive | collinear)
     covariance[unknown, unknown] = math.inf
     return covariance, insensitive, collinear
-
-
-def degrees_of_freedom(solution: Solution) -> Floats:
-    """Satterthwaite degrees of freedom of every free parameter; infinite if no between-trial variance matters. Source:
-    Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted likelihood in
-    the logarithms of the between-trial standard deviations. Shape (n_free,).
-    """
-    problem, state = solution.problem, solution.state
-    active = [k for k in range(2) if solution.estimable[k] and state.spread[k] > 1e-4]
-    size = problem.prior_mean.size
-    if not active:
-        return np.full(size, math.inf)
-    part = marginal(solution.cross_products, problem, state)
-
-    def spread_at(shifts: Floats) -> tuple[float, float]:
-        spread = list(state.spread)
-        for k, shift in zip(active, shifts, strict=True):
-            spread[k] *= math.exp(shift)
-        return spread[0], spread[1]
-
-    steps = LOG_STEP * np.eye(len(active))
-    slopes = [
-        (
-            _intervals_variances(part, problem, state, spread_at(step))
-            - _intervals_variances(part, problem, state, spread_at(-step))
-        )
-        / (2 * LOG_STEP)
-        for step in steps
-    ]
-    curvature = _curvature(lambda shifts: 0.5 * deviance(part, problem, state, spread_at(shifts)), len(active))
-    values, vectors = np.linalg.eigh(curvature)
-    determined = values > 1e-3
-    spread_covariance = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
-    gradient = np.column_stack(slopes)
-    uncertainty = np.einsum("pi,ij,pj->p", gradient, spread_covariance, gradient)
-    variances = _intervals_variances(part, problem, state, state.spread)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        degrees = 2 * variances**2 / uncertainty
-    return np.where(uncertainty > 0, np.maximum(degrees, 2.0), math.inf)
-
-
-def _intervals_variances(part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]) -> Floats:
-    return np.nan_to_num(np.diag(_covariance(part, problem, state, spread)[0]), posinf=0.0)
-
-
-def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
-    """Second derivatives of a function of `size` variables at zero, by central differences."""
-    step, unit = LOG_STEP, LOG_STEP * np.eye(size)
-    centre = function(np.zeros(size))
-    matrix = np.empty((size, size))
-    for i in range(size):
-        matrix[i, i] = (function(unit[i]) - 2 * centre + function(-unit[i])) / step**2
-        for j in range(i):
-            both = function(unit[i] + unit[j]) + function(-unit[i] - unit[j])
-            across = function(unit[i] - unit[j]) + function(unit[j] - unit[i])
-            matrix[i, j] = matrix[j, i] = (both - across) / (4 * step**2)
-    return matrix
 
 
 def student(dof: Floats) -> Floats:
@@ -381,15 +320,14 @@ def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, 
     # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
     depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
-    variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
+    variance, degrees = np.diag(plain), np.full(len(plain), np.inf)
     trials = [trial_data.trial for trial_data in predictor.data]
     for groups in (range(len(trials)), coarsest_groups(trials)):
-        summed = _summed_over(groups, information), _summed_over(groups, scores)
-        by_scatter = scatter_variances(*summed, problem, plain)
-        larger = by_scatter[0] > variance
-        variance, degrees = (
-            np.where(larger, new, old) for new, old in zip(by_scatter, (variance, degrees), strict=True)
+        by_scatter, few = scatter_variances(
+            _summed_over(groups, information), _summed_over(groups, scores), problem, plain
         )
+        degrees = np.where((by_scatter > variance) | np.isinf(degrees), few, degrees)
+        variance = np.maximum(variance, by_scatter)
     return plain, variance, degrees
 
 
@@ -420,10 +358,10 @@ def scatter_variances(
         scatter = float(np.sum(np.einsum("nk,nk->n", weights_of_score, score) ** 2))
         moved = np.einsum("nij,nj->ni", shares, weights_of_score)
         expected = np.diag(np.einsum("ni,ni->n", weights_of_score, moved)) - moved @ moved.T
-        squares = float(np.sum(expected**2))
-        variance[place] = scatter + float(root[k] @ constant @ root[k])
-        if squares > 0 and scatter > 0:
-            degrees[place] = max(np.trace(expected) ** 2 / squares * (variance[place] / scatter) ** 2, 1.0)
+        known, shown_by = float(root[k] @ constant @ root[k]), max(scatter, float(np.trace(expected)))
+        variance[place] = scatter + known
+        if (squares := float(np.sum(expected**2))) > 0:
+            degrees[place] = max(np.trace(expected) ** 2 / squares * (1 + known / shown_by) ** 2, 1.0)
     return variance, degrees
 
 
@@ -434,9 +372,10 @@ def widened_covariance(
     the scatter of trials. `sources` are where each of these errors comes from.
     """
     plain, variance, few = robust_variances(predictor, solution)
-    diagonal, at_most = np.diag(plain), model_precision.degrees
+    diagonal = np.diag(plain)
     ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
-    degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
+    # Where the between-trial standard deviations are the usual ones, no trial had to tell them.
+    degrees = np.where((ratio > 1) | any(solution.estimable), few, math.inf)
     covariance = (
         np.where(np.isfinite(model_precision.covariance), model_precision.covariance, 0.0) * ratio[:, None] * ratio
     )
