@@ -242,6 +242,15 @@ def test_trials_without_usable_motion_are_left_out_and_named(campaign):
         vt.fit(vt.base_model(), odd[2:])
 
 
+def test_a_copy_of_a_trial_is_left_out_and_named(campaign):
+    _, pairs, _ = campaign
+    first, copied = pairs[0], (replace(pairs[1][0], name="copied"), pairs[0][1])
+    data, left_out = prepare([*pairs, copied])
+    assert [one.trial.name for one in data] == [trial.name for trial, _ in pairs]
+    assert list(left_out) == ["copied"]
+    assert first[0].name in left_out["copied"]
+
+
 def test_watch_is_called_with_every_step_and_may_end_the_fit():
     pairs, watch = small_campaign(seed=31)[0], Mock()
     found, last = vt.fit(vt.base_model(), pairs, watch=watch), watch.call_args.args[0]

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 from test_pipeline import write_campaign
 
@@ -90,6 +92,19 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
         (tmp_path / name / "trials.csv").write_text("trial\n")
         assert "Snakemake cannot handle" in workflow.check_folder(tmp_path / name).problems[0].message
     assert workflow.path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
+
+
+def test_a_copied_track_is_named_by_check(tmp_path):
+    time_s = np.arange(200) / 1000
+    for name, seed in (("a", 1), ("b", 2), ("c", 1)):
+        noise_m = 1e-4 * np.random.default_rng(seed).standard_normal(200)
+        position_m = np.maximum(time_s - 0.05, 0) * 2 + noise_m
+        pd.DataFrame({"time_s": time_s, "position_m": position_m}).to_csv(tmp_path / f"{name}.csv", index=False)
+    rows = [f"{name},{name}.csv,24,200,400,20,3\n" for name in "abc"]
+    header = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+    (tmp_path / "trials.csv").write_text(header + "".join(rows), encoding="utf-8")
+    copied = [problem for problem in workflow.check_folder(tmp_path).problems if problem.code == "copied"]
+    assert [(problem.trial, problem.severity) for problem in copied] == [("c", "warning")]
 
 
 def test_a_check_of_the_same_files_is_made_once_and_one_that_finds_an_error_each_time(tmp_path, monkeypatch):

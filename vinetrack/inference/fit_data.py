@@ -362,8 +362,12 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
+    first_with: dict[bytes, str] = {}
     for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
+        original = first_with.setdefault(track.lead_position_m.tobytes(), trial.name)
         try:
+            if original != trial.name:
+                raise FitError(f"its positions are those of {original} to the last digit: give each trial its own")
             data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)

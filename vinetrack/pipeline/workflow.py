@@ -261,6 +261,12 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         if trial.track is not None:
             with contextlib.suppress(InputError):
                 tracks.append((trial, load_track(trial)))
+    first_with: dict[bytes, str] = {}
+    for trial, track in tracks:
+        if (original := first_with.setdefault(track.lead_position_m.tobytes(), trial.name)) != trial.name:
+            said = f"has the positions of {original} to the last digit, and is left out of the fit"
+            copied = {"severity": "warning", "file": SHEET, "trial": trial.name, "remedy": "give each trial its own"}
+            problems.append(Problem("copied", said, "track", **copied))
     speeds = [(trial, entry.mean_speed_m_s) for trial, entry in surveyor.facts.items()]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
