@@ -204,35 +204,20 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 
 class ReleaseSearch:
-    """Global search for the releases during a fit, with a safeguard against cycling. A release jumps where the trial's
-    likelihood, its effects integrated out, is higher. The steps of the fit minimise the misfit instead, and return to
-    the old release where the jump only gained volume of the likelihood.
+    """Global search for the releases during a fit. A release jumps where the trial's likelihood, its effects integrated
+    out, is higher.
     """
 
     def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
         self.predictor, self.problem = predictor, problem
-        self.returned = np.zeros(len(predictor.data), dtype=bool)
-        self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
-        self.theta_at_jump = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
     def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with likelier releases; None if there are none. The search leaves out trials pressurised during the
         recording, whose release the trace shows, and trials recorded at rest with a misfit far above noise, which
         another release would only compensate. Shapes: residuals (n_points,).
         """
-        release_s = state.trial_effects[:, RELEASE]
-        # 0.25: part of a jump within which a release counts as returned to where the jump began (chosen)
-        came_back = np.abs(release_s - self.jumped_from) < 0.25 * np.abs(self.jumped_to - self.jumped_from)
-        # Only if the shared parameters have not changed since the jump; otherwise they explain the return.
-        # 1e-3: largest change of a shared parameter, scaled, that counts as no change (chosen)
-        self.returned |= came_back & (np.max(np.abs(state.theta - self.theta_at_jump), axis=1, initial=0.0) < 1e-3)
         proposed = self._by_linear_model(state, residuals)
         accepted = state if proposed is None else self._confirmed(state, proposed)
-        jumped_s = accepted.trial_effects[:, RELEASE]
-        jumps = jumped_s != release_s
-        self.jumped_from = np.where(jumps, release_s, self.jumped_from)
-        self.jumped_to = np.where(jumps, jumped_s, self.jumped_to)
-        self.theta_at_jump[jumps] = state.theta
         return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
 
     def _by_linear_model(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
@@ -278,9 +263,6 @@ class ReleaseSearch:
             _trial_deviances(predictor, problem, proposed)
             < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
         )
-        if self.returned[rows].any():
-            lower = trial_costs(predictor, problem, proposed) < trial_costs(predictor, problem, current)
-            better &= lower | ~self.returned[rows]
         trial_effects = state.trial_effects.copy()
         trial_effects[rows[better]] = proposed.trial_effects[better]
         return replace(state, trial_effects=trial_effects)
