@@ -19,14 +19,14 @@ from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference import solving, trial_effects
+from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
-from vinetrack.inference.trial_effects import residuals_in, trial_costs, white_at_releases
+from vinetrack.inference.trial_effects import trial_costs, white_at_releases
 
 
 @pytest.fixture(scope="module")
@@ -506,21 +506,6 @@ def test_columns_at_a_release_are_the_shifted_and_whitened_ones(rho):
         columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
         columns[:, -1] = position_m - columns[:, -1]
         assert np.allclose(at.T, whiten(columns, first, rho, relative), rtol=1e-12, atol=1e-12)
-
-
-def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):
-    """A search one step later forgot the jump: 3 of 400 trials cycled eight times, in 40 steps of all trials."""
-    solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    residuals = residuals_in(predictor.linearise(solution.state.theta, solution.state.trial_effects))
-    there = solution.state.trial_effects.copy()
-    there[:, 0] -= 0.004
-    elsewhere = replace(solution.state, trial_effects=there)
-    monkeypatch.setattr(trial_effects.ReleaseSearch, "_confirmed", lambda *given: given[-1])
-    search = trial_effects.ReleaseSearch(predictor, solution.problem)
-    for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
-        monkeypatch.setattr(trial_effects.ReleaseSearch, "_by_linear_model", lambda *_, at=likelier: at)
-        search.likelier(begins, residuals)
-    assert search.returned.all()
 
 
 def test_a_fit_converges_from_its_own_solution(only_in_motion):

@@ -248,11 +248,9 @@ def solve(
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )
-    # 3.0, 4, 8: releases that no frame at rest determines are searched globally once the predicted decrease of a
-    # step falls below the first number, or after this many steps (along the valley between two releases
-    # Gauss–Newton steps become tiny); and how many of these searches may move a release (chosen)
-    searches_left, last_search, searched_in_vain = 8, 0, False
-    releases, at_corner = ReleaseSearch(predictor, problem), False
+    # 5, 4: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
+    # many of these searches may move one (chosen)
+    searches_left, releases, at_corner = 4, ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
@@ -274,16 +272,12 @@ def solve(
         small_step = predicted_decrease < least_decrease or at_corner
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
-        if searches_left and (
-            small_step or (predicted_decrease < 3.0 and not searched_in_vain) or iteration >= last_search + 4
-        ):
-            last_search, searched_in_vain = iteration, True
+        if searches_left and (small_step or iteration % 5 == 0):
             relocated = releases.likelier(state, residuals_in(columns))
+            searches_left -= 1 if relocated is not None else 4 * small_step
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
-                searches_left, searched_in_vain = searches_left - 1, False
                 continue
-            searches_left = 0 if small_step else searches_left
         if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
             converged = True
             break
