@@ -21,7 +21,7 @@ from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
-from vinetrack.inference.fit_data import prepare
+from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
@@ -249,6 +249,19 @@ def test_a_copy_of_a_trial_is_left_out_and_named(campaign):
     assert [one.trial.name for one in data] == [trial.name for trial, _ in pairs]
     assert list(left_out) == ["copied"]
     assert first[0].name in left_out["copied"]
+
+
+def test_trials_whose_gauge_was_at_the_end_of_its_range_are_left_out():
+    """Set to 14 to 36 kPa, recorded by a gauge that ends at 24 kPa; 20 kPa as a coarse gauge reads it."""
+    pairs, draw = [], np.random.default_rng(6)
+    for P in (14, 20, 20, 28, 36):
+        trial, noise_Pa = vine_trial(f"t{len(pairs)}", P), 50 * draw.standard_normal(200)
+        track = filmed(trial, draw)[0]
+        seen_Pa = np.minimum(1e3 * P + (0 if P == 20 else np.resize(noise_Pa, track.time_s.size)), 24e3)
+        pairs.append((trial, replace(track, pressure_Pa=np.broadcast_to(seen_Pa, track.time_s.size))))
+    assert set(not_measured(pairs)) == {"t3", "t4"}
+    assert set(not_measured(pairs[:4])) == {"t3"}
+    assert not not_measured(pairs[:3])
 
 
 def test_watch_is_called_with_every_step_and_may_end_the_fit():

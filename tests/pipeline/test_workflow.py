@@ -103,7 +103,7 @@ def test_a_copied_track_is_named_by_check(tmp_path):
     rows = [f"{name},{name}.csv,24,200,400,20,3\n" for name in "abc"]
     header = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
     (tmp_path / "trials.csv").write_text(header + "".join(rows), encoding="utf-8")
-    copied = [problem for problem in workflow.check_folder(tmp_path).problems if problem.code == "copied"]
+    copied = [problem for problem in workflow.check_folder(tmp_path).problems if problem.code == "not_measured"]
     assert [(problem.trial, problem.severity) for problem in copied] == [("c", "warning")]
 
 

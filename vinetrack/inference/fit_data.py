@@ -351,6 +351,36 @@ def pairs_of(
 # A single track may not show whether its positions are rounded, smoothed, or have an error that grows with speed.
 
 
+def not_measured(pairs: Pairs) -> dict[str, str]:
+    """Why the values of a trial were not measured in it, by its name: those of a copied track, and those of a gauge at
+    the end of its range, which stands at one value to the last digit: below a set pressure though it is noisy in other
+    trials, or at whatever pressure was set.
+    """
+    first_with: dict[bytes, str] = {}
+    reasons, ending_at, is_noisy = dict[str, str](), dict[float, list[Trial]](), False
+    for trial, track in pairs:
+        original = first_with.setdefault(track.lead_position_m.tobytes(), trial.name)
+        if original != trial.name:
+            reasons[trial.name] = f"its positions are those of {original} to the last digit: give each trial its own"
+        if track.pressure_Pa is not None and np.isfinite(track.pressure_Pa).any():
+            largest_Pa = float(np.nanmax(track.pressure_Pa))
+            # 0.1: part of a trace at its largest value from which it may stand at the end of the range (chosen)
+            if np.mean(track.pressure_Pa == largest_Pa) > 0.1:
+                ending_at.setdefault(largest_Pa, []).append(trial)
+            else:
+                is_noisy = True
+    for largest_Pa, trials in ending_at.items():
+        set_Pa = [trial.pressure_Pa for trial in trials]
+        # 1.1: ratio of pressures that a gauge tells apart (chosen)
+        if max(set_Pa) > 1.1 * min(set_Pa) or (is_noisy and min(set_Pa) > 1.1 * largest_Pa):
+            said = f"its recorded pressure stands at {largest_Pa / 1e3:g} kPa to the last digit, the sheet says"
+            reasons |= {
+                trial.name: f"{said} {trial.pressure_Pa / 1e3:g}: the end of the gauge's range? Blank its trace"
+                for trial in trials
+            }
+    return reasons
+
+
 def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
     """Data of the trials that can be fitted, and the reason for each that cannot, by name. Returns data, left_out
     (reason by name of trial).
@@ -362,12 +392,11 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
-    first_with: dict[bytes, str] = {}
+    refused = not_measured(pairs)
     for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
-        original = first_with.setdefault(track.lead_position_m.tobytes(), trial.name)
         try:
-            if original != trial.name:
-                raise FitError(f"its positions are those of {original} to the last digit: give each trial its own")
+            if trial.name in refused:
+                raise FitError(refused[trial.name])
             data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)

@@ -243,6 +243,7 @@ class CheckReport:
 def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     """Check sheet, settings, effects, tracks and recordings of an experiment; `keep` keeps what is tracked."""
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
+    from vinetrack.inference.fit_data import not_measured
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import load_track
@@ -261,12 +262,10 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         if trial.track is not None:
             with contextlib.suppress(InputError):
                 tracks.append((trial, load_track(trial)))
-    first_with: dict[bytes, str] = {}
-    for trial, track in tracks:
-        if (original := first_with.setdefault(track.lead_position_m.tobytes(), trial.name)) != trial.name:
-            said = f"has the positions of {original} to the last digit, and is left out of the fit"
-            copied = {"severity": "warning", "file": SHEET, "trial": trial.name, "remedy": "give each trial its own"}
-            problems.append(Problem("copied", said, "track", **copied))
+    problems += [
+        Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
+        for name, why in not_measured(tracks).items()
+    ]
     speeds = [(trial, entry.mean_speed_m_s) for trial, entry in surveyor.facts.items()]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
