@@ -94,6 +94,9 @@ def diagnose(
         fit = initial_fit(model, pairs, effects, profile=False)
     else:
         fit = with_host(fitted, host_for(model, effects))
+    unfit: dict[str, list[str]] = {}
+    for name, reason in fit.left_out.items():
+        unfit.setdefault(reason, []).append(name)
     fit = replace(fit, left_out={**left_out, **fit.left_out})
 
     def without(names: Sequence[str]) -> Diagnosis:
@@ -102,6 +105,8 @@ def diagnose(
 
     result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
     result = with_lost_frames(result, dropped)
+    told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
+    result = replace(result, notes=(*result.notes, *told))
     missed = relative_residuals(result.fits[-1].predictor, result.fits[-1].solution)
     data = result.fits[-1].predictor.data
     far_off = [one.trial.name for one, part in zip(data, missed, strict=True) if part > LARGEST_MISSED]
