@@ -27,7 +27,7 @@ from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.errors import student, trial_information
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import at_correlation, whiten
 from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
@@ -436,8 +436,7 @@ def fit(
     data, unusable = prepare(pairs, weighted=noise is None)
     left_out = {**left_out, **unusable}
     if not data:
-        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise FitError(f"No trial can be fitted: {reasons or 'there is none'}.")
+        raise none_to_fit(left_out)
     fixed, free = tuple(fixed), tuple(free)
     options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
     fixed_terms = FixedTerms(spreads)

@@ -342,7 +342,15 @@ def pairs_of(
             pairs.append((trial, correct_frames(load_track(trial))))
         except InputError as error:
             left_out[trial.name] = str(error)
+    if not pairs:
+        raise none_to_fit(left_out)
     return pairs, left_out
+
+
+def none_to_fit(left_out: Mapping[str, str]) -> FitError:
+    """The error of an experiment without a trial to fit; `left_out` are the reasons, by name of trial."""
+    reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
+    return FitError(f"No trial can be fitted: {reasons or 'there is none'}.")
 
 
 # ------------------------------------------------------------------------------
