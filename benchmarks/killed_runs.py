@@ -60,11 +60,11 @@ def begun(folder: Path, log: Path) -> subprocess.Popen[bytes]:
 
 
 def hashes(results: Path) -> dict[str, str]:
-    """SHA-256 of every file of the results but logs and what Snakemake keeps, by its path."""
+    """SHA-256 of every file of the results but logs, what Snakemake keeps and who wrote, by its path."""
     return {
         path.relative_to(results).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(results.rglob("*"))
-        if path.is_file() and not {"logs", ".kept", ".snakemake"} & set(path.relative_to(results).parts)
+        if path.is_file() and not {"logs", ".kept", ".snakemake", "experiment.json"} & set(path.relative_to(results).parts)
     }
 
 

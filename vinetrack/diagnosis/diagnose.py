@@ -107,11 +107,9 @@ def diagnose(
     result = with_lost_frames(result, dropped)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
     result = replace(result, notes=(*result.notes, *told))
-    missed = relative_residuals(result.fits[-1].predictor, result.fits[-1].solution)
-    data = result.fits[-1].predictor.data
-    far_off = [one.trial.name for one, part in zip(data, missed, strict=True) if part > LARGEST_MISSED]
-    if 0 < len(far_off) <= len(missed) / 2:
-        result = replace(result, notes=(*result.notes, remark("far_off", names=far_off, percent=100 * missed.max())))
+    if far_off := _far_off(result.fits[-1]):
+        told = [remark("far_off", names=list(far_off), percent=100 * max(far_off.values()))]
+        result = replace(result, notes=(*result.notes, *told))
     if outliers_note:
         result = replace(result, notes=(*result.notes, outliers_note))
     if ladder:
@@ -123,6 +121,20 @@ def diagnose(
     if advice:
         result = _with_advice(result, limits, report)
     return result
+
+
+def _far_off(fit: Fit) -> dict[str, float]:
+    """Trials that a model misses though it describes the others, and by which part of their growth: by far in itself,
+    or far more than by their noise and than it misses the others. None where half of the trials are missed.
+    """
+    missed, data = relative_residuals(fit.predictor, fit.solution), fit.predictor.data
+    noises = [trial_data.noise_m / max(float(np.ptp(trial_data.lead_position_m)), 1e-9) for trial_data in data]
+    # 5, 3: times the median of all trials, and times its own noise, from which a trial is far off (chosen)
+    beside_others = (missed > 5 * np.median(missed)) & (missed > 3 * np.array(noises))
+    far_off = (missed > LARGEST_MISSED) | beside_others
+    if np.mean(far_off) > 0.5:
+        return {}
+    return {data[i].trial.name: float(missed[i]) for i in np.flatnonzero(far_off)}
 
 
 def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Diagnosis:
