@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PRESSURES_KPA = (30, 36, 42)
 SHEET = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,mm_per_px\n"
 SETTINGS = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
+NOT_COMPARED = {"logs", ".kept", ".snakemake", "experiment.json"}
 SOONEST_S = 1.0
 """Chosen: before that nothing has begun."""
 
@@ -64,7 +65,7 @@ def hashes(results: Path) -> dict[str, str]:
     return {
         path.relative_to(results).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(results.rglob("*"))
-        if path.is_file() and not {"logs", ".kept", ".snakemake", "experiment.json"} & set(path.relative_to(results).parts)
+        if path.is_file() and not NOT_COMPARED & set(path.relative_to(results).parts)
     }
 
 
