@@ -13,9 +13,11 @@ from test_pipeline import write_campaign
 
 from vinetrack.cli import commands
 from vinetrack.core.problems import ExperimentError, UserError
+from vinetrack.inference.fit_data import pairs_of
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
 from vinetrack.results import origin
+from vinetrack.tracks.frame_timing import longer_than_stated
 
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
@@ -94,17 +96,23 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
     assert workflow.path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
-def test_a_copied_track_is_named_by_check(tmp_path):
+def test_check_names_a_copied_track_and_one_that_is_longer_than_its_vine(tmp_path):
+    """Tracks of 300 mm of vines of 400 mm; the last vine is 250 mm long."""
     time_s = np.arange(200) / 1000
-    for name, seed in (("a", 1), ("b", 2), ("c", 1)):
+    for name, seed in (("a", 1), ("b", 2), ("c", 1), ("d", 3)):
         noise_m = 1e-4 * np.random.default_rng(seed).standard_normal(200)
         position_m = np.maximum(time_s - 0.05, 0) * 2 + noise_m
         pd.DataFrame({"time_s": time_s, "position_m": position_m}).to_csv(tmp_path / f"{name}.csv", index=False)
-    rows = [f"{name},{name}.csv,24,200,400,20,3\n" for name in "abc"]
+    rows = [f"{name},{name}.csv,24,200,{250 if name == 'd' else 400},20,3\n" for name in "abcd"]
     header = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
     (tmp_path / "trials.csv").write_text(header + "".join(rows), encoding="utf-8")
-    copied = [problem for problem in workflow.check_folder(tmp_path).problems if problem.code == "not_measured"]
-    assert [(problem.trial, problem.severity) for problem in copied] == [("c", "warning")]
+    problems = workflow.check_folder(tmp_path).problems
+    assert [(one.trial, one.severity) for one in problems if one.code == "not_measured"] == [("c", "warning")]
+    longer = [one for one in problems if one.code == "longer_than_stated"]
+    assert [one.column for one in longer] == ["length_mm"]
+    facts = longer_than_stated(pairs_of(tmp_path)[0]).facts
+    assert (facts["count"], facts["name"], facts["length_m"]) == (1, "d", 0.25)
+    assert facts["travel_m"] == pytest.approx(0.295, abs=0.005)
 
 
 def test_a_check_of_the_same_files_is_made_once_and_one_that_finds_an_error_each_time(tmp_path, monkeypatch):

@@ -45,7 +45,7 @@ from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.tracks.frame_timing import correct_frames
+from vinetrack.tracks.frame_timing import correct_frames, longer_than_stated
 from vinetrack.tracks.position_noise import rejected_points_note
 
 if TYPE_CHECKING:
@@ -107,6 +107,8 @@ def diagnose(
     result = with_lost_frames(result, dropped)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
     result = replace(result, notes=(*result.notes, *told))
+    if longer := longer_than_stated(pairs):
+        result = replace(result, notes=(*result.notes, longer))
     if far_off := _far_off(result.fits[-1]):
         told = [remark("far_off", names=list(far_off), percent=100 * max(far_off.values()))]
         result = replace(result, notes=(*result.notes, *told))

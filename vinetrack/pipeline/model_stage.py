@@ -50,7 +50,7 @@ from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
-from vinetrack.tracks.frame_timing import mean_speed
+from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -165,7 +165,8 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
         return diagnosis
-    notes = (*contradictions.values(), *diagnosis.notes)
+    told = set(contradictions.values())
+    notes = (*contradictions.values(), *(note for note in diagnosis.notes if str(note) not in told))
     contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes)
     return replace(contradicted, explanation=f"{verdict_sentence(contradicted)} {diagnosis.explanation}")
 
@@ -179,6 +180,8 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     sentences = {}
     for column, (first, *others) in noted.items():
         sentences[column] = f"{first} (and {len(others)} more trial{'s'[: len(others) > 1]})" if others else first
+    if longer := longer_than_stated(pairs):
+        sentences["length_mm"] = str(longer)
     speeds = [(trial, mean_speed(track)) for trial, track in pairs]
     return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 

@@ -12,12 +12,14 @@ noise may have heavy tails. Outliers are rejected afterwards.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Indices, Track, with_flag
+from vinetrack.core.problems import Remark, remark
+from vinetrack.core.records import Floats, Indices, Track, Trial, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
@@ -268,3 +270,19 @@ def mean_speed(track: Track) -> float:
     early, late = (int(np.searchsorted(travel_m, part * travel_m[-1])) for part in (0.2, 0.9))
     duration_s = float(time_s[late] - time_s[early])
     return float(travel_m[late] - travel_m[early]) / duration_s if duration_s > 0 else np.nan
+
+
+def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
+    """Say which tracks are longer than their vine, whose tip cannot run farther; blank where none is."""
+    travels: list[tuple[Trial, float]] = []
+    for trial, track in pairs:
+        position_m = track.lead_position_m[track.usable]
+        if trial.travel_ratio != 1 and math.isfinite(trial.length_m) and position_m.size >= 5:
+            travels.append((trial, float(np.quantile(position_m, 0.99) - np.median(position_m[:3]))))
+    # 1.05: travel, in lengths of the vine, that an error of length or scale of a few per cent leaves (chosen)
+    longer = [(travel_m / one.length_m, one, travel_m) for one, travel_m in travels if travel_m > 1.05 * one.length_m]
+    if not longer:
+        return Remark()
+    _, trial, travel_m = max(longer, key=lambda one: one[0])
+    facts = {"count": len(longer), "name": trial.name, "travel_m": travel_m, "length_m": trial.length_m}
+    return remark("longer_than_stated", **facts)
