@@ -55,11 +55,17 @@ class Experiment:
     @property
     def blank_notes(self) -> list[str]:
         """Sentences that state which default blank cells stand for, where it affects the physics."""
-        blank = [name for name in self.angle_blank if name not in self.left_out]
-        if not blank:
-            return []
-        which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
-        return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+        blank, notes = [name for name in self.angle_blank if name not in self.left_out], []
+        if blank:
+            which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
+            notes = [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+        correlation = order_pressure_correlation(self.trials)
+        if abs(correlation) >= CONFOUNDED and not trial_order(self.trials)[1]:
+            notes.append(
+                f"order is blank: taken as that of the rows, which follows the pressure ({correlation:.2f}), so that a "
+                "drift would look like a physical effect; number the trials as they were run"
+            )
+        return notes
 
     @property
     def user_effects(self) -> Mapping[str, Effect]:
@@ -391,6 +397,8 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
 # A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
 # rises with the order, the data cannot distinguish such a drift from an effect of pressure.
 
+CONFOUNDED = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
+
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     """Return the rank of every trial, from 0, as they were run, shape (n_trials,), and whether the sheet says so."""
@@ -420,15 +428,11 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
     from pandas import DataFrame
 
     correlation = order_pressure_correlation(trials)
-    # 0.7: rank correlation above which order and pressure count as confounded (derived)
-    if abs(correlation) >= 0.7:
+    if abs(correlation) >= CONFOUNDED and trial_order(trials)[1]:
         message = (
             f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
-            if trial_order(trials)[1]
-            else f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials "
-            "were run in this order, a drift would look like a physical effect"
         )
-        remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
+        remedy = "run the trials in random order, or repeat six of them in random order"
         yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
     frame = DataFrame(map(vars, trials), columns=["vine", "condition", *GROUPINGS])
     for column in GROUPINGS if trials else ():
@@ -493,11 +497,12 @@ def _check_track(trial: Trial) -> list[Problem]:
     elif abs((frames := step_s * trial.capture_fps) - 1) > 0.02:
         remarks["capture_fps"] = f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?"
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
-    # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
-    if travel_m > 2 * trial.length_m:
+    # A factor of 2 allows for a poor scale or axis, but not for millimetres or pixels read as metres; 0.001 for the
+    # beginning of a motion, but not for metres read as pixels.
+    if not 0.001 < travel_m / trial.length_m < 2 and math.isfinite(trial.length_m):
         remarks["longer_than_the_vine"] = (
             f"travels {travel_m:.4g} m, but the vine is {1000 * trial.length_m:g} mm long by the sheet: is length_mm "
-            "in millimetres, and are the positions in metres?"
+            "in millimetres, and what are the units of the positions (pixels take mm_per_px)?"
         )
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
         remarks["backwards"] = "runs backwards: position should grow as the vine does"

@@ -91,6 +91,11 @@ class TwoPoints(_TwoEnds):
     length_mm: Annotated[Positive, "Two marks of a ruler in the plane of growth."]
     """Distance between the two points."""
 
+    @property
+    def mm_per_px(self) -> float:
+        """The scale, the same everywhere."""
+        return self.length_mm / math.dist(self.from_px, self.to_px)
+
 
 class Board(_Strict):
     """A printed target."""
@@ -353,6 +358,10 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
         return Problem("unknown_key", "is not a setting", remedy=remedy, **place)
     if detail["type"] == "missing":
         return Problem("missing", "is missing", remedy="add it", **place)
+    if detail["type"].startswith("union_tag"):  # of a calibration, by its kind
+        kind = detail["ctx"].get("tag", "")
+        place |= {"column": "calibration.kind", "value": kind, "allowed": ", ".join(CALIBRATIONS)}
+        return Problem("not_a_choice", "is unknown", remedy=did_you_mean(kind, CALIBRATIONS) or "add it", **place)
     place["value"] = str(detail["input"]) if isinstance(detail["input"], str | int | float | bool) else None
     error = detail.get("ctx", {}).get("error")
     if isinstance(error, InputError):
