@@ -49,7 +49,7 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
     assert str(back) == str(fit)
     for content in ("[]", '{"model": 3}', '{"numbers": [1]}'):
         results.fit.write_text(content, encoding="utf-8")
-        with pytest.raises(ResultsError, match="delete it and run snakemake again"):
+        with pytest.raises(ResultsError, match="delete it and run `vinetrack run` again"):
             read_fit(results)
 
 

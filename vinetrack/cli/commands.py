@@ -57,7 +57,9 @@ def _check(experiment: Path) -> Answer:
     from vinetrack.pipeline.workflow import check_folder, find_experiment
 
     checked = check_folder(find_experiment(experiment))
-    lines = checked.lines() if checked.problems else [*checked.lines(), f"{experiment}: no problems found."]
+    lines = checked.lines()
+    if all(problem.severity == "note" for problem in checked.problems):
+        lines.append(f"{experiment}: no problems found.")
     return lines, checked.to_json(), checked.failed
 
 
@@ -76,8 +78,8 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
 
 
 def _run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
-    are kept, since reading a diagnosis takes most of a second.
+    """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last.
+    They are kept, since reading a diagnosis takes most of a second.
     """
     from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
 
@@ -89,13 +91,13 @@ def _run_lines(folder: Path) -> list[str]:
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
         failed = trials[trials["status"] == "failed"]
-        lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
-        lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
+        more = f" (and {len(failed) - 1} more, see the report)" if len(failed) > 1 else ""
+        lines = [f"{row.trial} failed{more}: {row.reason}" for row in failed.head(1).itertuples()]
         lines.append(f"Report: {results.report}")
         if diagnosis is None or not diagnosis.verdict:
             return [*lines, "" if diagnosis is None else diagnosis.explanation]
-        notes = [f"! {note}" for note in diagnosis.notes[:1]]
-        return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
+        lines += table_lines(diagnosis, in_short=True)
+        return [*lines, *(f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11), verdict_line(diagnosis)]
 
     state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
     return Kept(folder).made("lines", state, summary)

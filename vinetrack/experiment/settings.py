@@ -372,7 +372,7 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
 
 
 # ------------------------------------------------------------------------------
-# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning.
+# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a note.
 
 
 def _in_other_units(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -381,7 +381,7 @@ def _in_other_units(names: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Convert columns in other units to those of the sheet, with a warning each; of two units the blank gives way."""
+    """Convert columns in other units to those of the sheet, with a note each; of two units the blank gives way."""
     problems: list[Problem] = []
     known, renamed = _in_other_units(COLUMNS), dict[str, tuple[str, str]]()
     taken = {name for name in table.columns if any(row[name] for row in table.rows)}
@@ -403,7 +403,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 
 def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> None:
-    """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
+    """Convert keys in other units to those of the settings, with a note each; of two units the blank gives way."""
     of_group: dict[str, Any] = {"": [ExperimentSettings], "limits": [Limits], "axis": [AxisSettings]}
     for group, models in (of_group | {"calibration": CALIBRATIONS.values()}).items():
         keys, path = (document.content.get(group), (group,)) if group else (document.content, ())
@@ -434,7 +434,7 @@ def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
 def _conversion(name: str, unit: str, **place: Any) -> Problem:
     own = split_unit(name)[1]
     message = f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
-    return Problem("unit", message, severity="warning", **place)
+    return Problem("unit", message, severity="note", **place)
 
 
 # ------------------------------------------------------------------------------

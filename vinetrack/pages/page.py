@@ -52,6 +52,7 @@ from vinetrack.pages.plots import (
     theme,
     vine_colours,
 )
+from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
@@ -75,7 +76,7 @@ def headline(
         refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
-        command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
+        command=command_for_results(campaign.experiment.folder, campaign.folder),
     )
 
 
@@ -375,7 +376,7 @@ class Page:
             rows = verdict_table(diagnosis)
             advice = next_experiment(diagnosis.next_experiment)
             pairs = tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else pairs
-        command = f"vinetrack diagnose {self.campaign.folder.as_posix()}"
+        command = shlex.join(["vinetrack", "diagnose", self.campaign.folder.as_posix()])
         set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, rows=rows, pairs=pairs))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
 
@@ -405,7 +406,7 @@ class Page:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return
-        rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
+        rerun = command_for_results(folder, self.campaign.folder)
         self.saved.text = panel("saved", path=path.as_posix(), model=model_text(effects), rerun=rerun)
 
     def close(self) -> None:

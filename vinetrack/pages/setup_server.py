@@ -209,7 +209,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         "units": {key: unit.text for key, unit in UNITS.items()},
         "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
-        "kept": list(present.columns) if present.rows else ["trial", "video"],
+        "kept": list(present.columns) if present.rows else ["trial", "video", "track"],
         "unsaved": not (folder / SETTINGS).exists() or not present.rows or cells_of(present) != cells_of(sheet),
         "shared": {key: str(value) for key, value in shared_values(draft.settings).items()},
         "calibration": content.get("calibration"),
@@ -219,7 +219,7 @@ def page_state(folder: Path) -> dict[str, Any]:
             for trial, given in draft.corrections.items()
         },
         "pictures": list_pictures(folder),
-        "traces": list_tables(folder),
+        "traces": list_tables(folder, ".csv"),
         "notes": list_notes(folder),
     }
 
@@ -432,19 +432,20 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
 
 def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept."""
-    draft = open_draft(folder)
+    present, draft = read_sheet(folder), open_draft(folder)
     written = write_draft(folder, draft)
-    rows = draft.sheet.rows
-    filled = [name for name in draft.sheet.columns if name not in ("trial", "video") and any(r.get(name) for r in rows)]
+    columns, added = draft.sheet.columns, draft.sheet.rows[len(present.rows) :]
+    filled = [name for name in columns if name not in ("trial", "video", "track") and any(r.get(name) for r in added)]
     for name in written:
         say(f"Written: {folder / name}")
     if not written:
         say(f"{SHEET} and {SETTINGS} of {folder} already contain every recording.")
-    say(f"{len(rows)} trials; from the names of recordings: {', '.join(filled) if filled else 'nothing'}.")
+    named = f", {len(added)} of them new; from their names: {', '.join(filled) or 'nothing'}" if added else ""
+    say(f"{len(draft.sheet.rows)} trials{named}.")
     problems = [*check_experiment(folder), *_scale_missing(draft)]
     errors = [problem for problem in problems if problem.severity == "error" and problem.column]
     missing = {problem.column for problem in errors if problem.code in ("missing", "blank")}
-    blanks = [*(name for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
+    blanks = [*(column_of(name, columns) for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
     say(f"Then: vinetrack check {folder}")
