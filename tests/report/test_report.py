@@ -57,11 +57,6 @@ def windows(*names: str) -> pd.DataFrame:
     return pd.DataFrame([{"trial": name, **row} for name in names], columns=["trial", *row])
 
 
-def curves(*names: str) -> dict[str, pd.DataFrame]:
-    time_s = np.linspace(0, 0.3, 300)
-    return {name: pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": 1 - np.exp(-time_s / 0.02)}) for name in names}
-
-
 PROVENANCE = {
     "vinetrack": "1.2.3", "python": "3.11", "platform": "Linux", "model": ["gravity"], "libraries": {"numpy": "2"},
     "inputs": {"trials.csv": "abc"}, "settings": {"damping": {"resamples": 777, "seed": 1}},
@@ -72,7 +67,7 @@ def page(**changes: object) -> str:
     content = dict.fromkeys(("clip", "fit", "comparison", "check", "diagnosis", "moved", "laws"))
     content |= {key: {} for key in ("motions", "strips", "flags", "calibrations", "clips", "effects")}
     content |= {"name": "vines", "trials": trials("a"), "windows": windows("a"), "damping": damping("v")}
-    content |= {"provenance": PROVENANCE, "kinematics": curves("a"), "figures": [], "sections": [], "notes": []}
+    content |= {"provenance": PROVENANCE, "figures": [], "sections": [], "notes": []}
     return build.build_report({**content, **changes})
 
 
@@ -160,7 +155,7 @@ def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short
     given = SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed)
     svg = build.inline_picture(given, "law", 'a "law"')
     assert svg.startswith("<svg")
-    for kept in ("currentColor", "var(--blue)", 'viewBox="0 0 504 360"', 'id="law-p1"', "url(#law-p1)"):
+    for kept in ("currentColor", "var(--blue)", 'viewBox="0 0 504 360"', 'id="law-0"', "url(#law-0)"):
         assert kept in svg
     for made in ('aria-label="a &quot;law&quot;"', "M 0.12 0 L 5 5", "matrix(0.123456 0", "data:image/webp"):
         assert made in svg
@@ -344,7 +339,6 @@ def address(tmp_path_factory):
     html = page(
         trials=trials(*names, reason="a reason that is long enough to need a line of its own on any screen"),
         windows=windows(*names),
-        kinematics=curves(*names),
         figures=[build.ReportFigure(key, key, "caption", svg, f"{key}.csv", "a\n1\n") for key, svg in pictures.items()],
         motions=dict.fromkeys(names, pictures["before_after"]),
         strips=dict.fromkeys(names, pictures["ladder"]),
@@ -391,7 +385,8 @@ def test_page_and_pictures_follow_a_dark_screen(chrome, address):
     ask = {
         "page": "getComputedStyle(document.body).backgroundColor",
         "text": "getComputedStyle(document.querySelector('#figure-ladder text')).fill",
-        "grid": "getComputedStyle(document.querySelector('#figure-ladder path[style*=\"--grid\"]')).stroke",
+        "grid": "getComputedStyle(document.querySelector('#figure-ladder ' + [...document.styleSheets[0].cssRules]"
+        ".find((rule) => rule.style?.stroke?.includes('--grid')).selectorText)).stroke",
     }
     brightness = {}
     for scheme in ("light", "dark"):

@@ -92,7 +92,7 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
     trials = before_after.groupby("trial", sort=False)
     for _, part in trials:
-        shown = st.thinned(part[part["time_s"] >= -0.06 * part["time_s"].iloc[-1]], 160)
+        shown = st.thinned(part[part["time_s"] >= -0.06 * part["time_s"].iloc[-1]], 60)
         time_ms, measured_mm = st.column(shown, "time_s", 1e3), st.column(shown, "lead_position_m", 1e3)
         growth.plot(time_ms, measured_mm, ".", color=st.MUTED, ms=4.5, mew=0)
         for model, (colour, line, _) in models.items():

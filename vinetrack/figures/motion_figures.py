@@ -39,6 +39,7 @@ def draw_trial_motion(
     counts = f"{len(kinematics)} points"
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
+    kinematics = st.thinned(kinematics, 60)
     strip_from, strip_in = 0.86, 0.24 * max(len(windows), 1)
     speed_from = strip_from + strip_in + 0.12
     lead_from = speed_from + 2.1 + 0.12
@@ -54,7 +55,7 @@ def draw_trial_motion(
     speed = st.Panel(sheet, (0.9, speed_from, 5.5, 2.1), over, _speed_limits(speed_m_s, two_sigma_m_s))
     strip = st.Panel(sheet, (0.9, strip_from, 5.5, strip_in), over, (len(windows) - 0.4, -0.6))
 
-    step = max(len(track) // 300, 1)
+    step = max(len(track) // 40, 1)  # chosen: few points, since the curve goes through them, keep the figure small
     lead.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
     lead.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
     lead.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)
@@ -167,7 +168,7 @@ def _model_panels(
     if not shown:
         return None, []
     n, n_trials = len(shown), sum(trajectories[row.condition]["trial"].nunique() for row in shown)
-    n_points = min(max(12_000 // n_trials, 25), 150)  # 12,000 in all keep the SVG below a megabyte
+    n_points = min(max(1_000 // n_trials, 25), 150)  # 1,000 in all keep the SVG below 50 kB (measured)
     title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
     if len(known) > n:
         title += f"; the {n} of {len(known)} conditions with the largest error"

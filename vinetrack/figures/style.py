@@ -206,7 +206,6 @@ class Panel:
         off_in: float = 0.0,
     ) -> None:  # fmt: skip
         """Draw the scale of the left, right or bottom, in its values times a factor, at a distance from the panel."""
-        from matplotlib.collections import LineCollection
         from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
         left, bottom, right, _ = self.box.extents
@@ -233,8 +232,10 @@ class Panel:
         zero = at(values, 0.0)
         lines = list(zip(zero, at(values, -depth_in), strict=True)) if grid else []
         marks = [*zip(zero, at(values, 0.05), strict=True), (at(start, 0.0)[0], at(end, 0.0)[0])]
-        style: dict[str, Any] = {"colors": [GRID] * len(lines) + [INK] * len(marks), "linewidths": 0.8, "zorder": 0.5}
-        self.sheet.add_collection(LineCollection([*lines, *marks], **style), autolim=False)
+        for colour, pieces in ((GRID, lines), (INK, marks)):  # each a single line with gaps, which is small in an SVG
+            if pieces:
+                ends = np.concatenate([[*piece, (math.nan, math.nan)] for piece in pieces])
+                self.sheet.plot(*ends.T, color=colour, lw=0.8, zorder=0.5)
         if not numbered:
             return
         formatter = ScalarFormatter()
