@@ -350,7 +350,7 @@ def place_block(
             notes.append(f"No recording for “{' '.join(cells)}”: left out.")
             continue
         for name, cell in zip(header, cells, strict=False):
-            if name and name != "trial":
+            if cell and name and name != "trial":
                 column = column_of(name, columns)
                 placed.append((row, column, in_unit_of(column, name, cell, decimal)))
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
@@ -427,7 +427,7 @@ def list_pictures(folder: Path) -> list[str]:
 TABLES = (".csv", ".txt", ".tsv", ".trk")  # Endings of files that may be tracks
 
 
-def list_tables(folder: Path, *suffixes: str) -> list[str]:
+def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
     """Return tables with these endings, which may be pressure traces, as paths relative to the folder."""
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
@@ -438,7 +438,7 @@ def list_tables(folder: Path, *suffixes: str) -> list[str]:
 def list_tracks(folder: Path) -> list[str]:
     """Return files of positions measured elsewhere, whatever rate and scale they leave open."""
     found = []
-    for name in list_tables(folder, *TABLES):
+    for name in list_tables(folder, TABLES):
         with suppress(InputError):
             read_track(folder / name, capture_fps=1.0, m_per_px=1e-3)
             found.append(name)
@@ -497,7 +497,8 @@ def _cells_of_name(recording: str) -> dict[str, tuple[str, str]]:
                 name = "length" if name == "diameter" and not letters and name in of_part else name
                 own = column_of(name, COLUMNS)
                 column = next((other for other in (own, *other_units(own)) if other.lower() == f"{name}_{unit}"), "")
-                if name and (column or not unit):
+                # After a letter, one digit counts trials or takes: `t1` is no thickness.
+                if name and (column or not unit) and (unit or len(letters) != 1 or len(number) > 1):
                     cell = number.replace("p", ".")
                     of_part[name] = column or own, f"{float(cell):g}" if COLUMNS[own].kind == "number" else cell
         cells |= of_part

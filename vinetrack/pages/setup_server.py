@@ -219,7 +219,7 @@ def page_state(folder: Path) -> dict[str, Any]:
             for trial, given in draft.corrections.items()
         },
         "pictures": list_pictures(folder),
-        "traces": list_tables(folder, ".csv"),
+        "traces": list_tables(folder),
         "notes": list_notes(folder),
     }
 
