@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
+from hand_diagnosis import VERDICTS, diagnosis, ladder, refused
 
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
@@ -93,7 +93,6 @@ def folder(path: Path, content: dict | None, after: bool = True) -> Results:
     if content is not None:
         (path / "diagnosis.json").write_text(json.dumps(content))
     ladder("", *content.get("effects", []) if content else ()).to_csv(results.ladder, index=False)
-    moved().to_csv(results.diagnosed("moved.csv"), index=False)
     for condition in ("slow", "fast"):
         parts = []
         for trial in (t for t, c in TRIALS.items() if c == condition):

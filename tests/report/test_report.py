@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from chrome import Chrome, find_chrome
-from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, moved, number
+from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, number
 from PIL import Image
 
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
@@ -64,7 +64,7 @@ PROVENANCE = {
 
 
 def page(**changes: object) -> str:
-    content = dict.fromkeys(("clip", "fit", "comparison", "check", "diagnosis", "moved", "laws"))
+    content = dict.fromkeys(("clip", "fit", "comparison", "check", "diagnosis"))
     content |= {key: {} for key in ("motions", "strips", "flags", "calibrations", "clips", "effects")}
     content |= {"name": "vines", "trials": trials("a"), "windows": windows("a"), "damping": damping("v")}
     content |= {"provenance": PROVENANCE, "figures": [], "sections": [], "notes": []}
@@ -188,7 +188,7 @@ def shown(content: dict, **changes: object) -> str:
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict):
-    html = shown(diagnosis(verdict), moved=moved())
+    html = shown(diagnosis(verdict))
     assert heading(html).startswith(f"{verdict} ")
     assert f'class="badge badge-{verdict}"' in html
     tags = Tags(html)
@@ -202,9 +202,7 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
     assert heading(page(diagnosis=read(bare))).startswith(verdict)
 
 
-def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit():
-    found = [list(row) for row in build.moved_table(moved()).rows]
-    assert found == [["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"], ["γ", "–", "1.1700 ± 0.0040"]]
+def test_upper_limits_are_in_the_displayed_unit():
     found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
     assert build.upper_limits(found, {}) == [("leak", "k", "2.50 kPa")]
     unfitted = candidate("pressure_drive", 1.0, numbers=[], largest={"pressure_drive.k": 1.0})
@@ -345,7 +343,6 @@ def address(tmp_path_factory):
         flags=dict.fromkeys(names, ("", "doubtful")),
         clip={"trial": names[0], "caption": "caption", "mp4": (folder / "a.mp4").read_bytes(), "poster": b""},
         diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
-        moved=moved(),
     )
     (folder / "report.html").write_text(html, encoding="utf-8")
     return (folder / "report.html").as_uri()

@@ -25,11 +25,9 @@ from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, RULE_NAMES, VERMILLION, rows
-from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import (
     LAW_METHODS,
     POWER_COLUMNS,
-    PREFERRED,
     damping_headline,
     false_alarm_sentence,
     power_rows,
@@ -41,7 +39,6 @@ from vinetrack.narrative.verdict_text import (
     expected_text,
     is_finite,
     listed_names,
-    quantity_text,
     settled_rows,
     spaced_name,
     verdict_sentence,
@@ -196,8 +193,6 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
-        "moved": moved_table(content["moved"]),
-        "laws": law_rows(content["laws"]),
         "notes": list(diagnosis.notes),
     }
 
@@ -310,37 +305,6 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "learned": str(learned.get("sentence") or ""),
         "weights": weights,
     }
-
-
-def moved_table(moved: pd.DataFrame | None) -> ReportTable:
-    """Return the change of the parameters as effects were added, one column per model."""
-    entries = [] if moved is None else moved.fillna({"vine": "", "added": ""}).to_dict("records")
-    cells: dict[tuple[str, str], dict[str, str]] = {}
-    titles: dict[tuple[str, str], str] = {}
-    for entry in entries:
-        key = (str(entry["parameter"]), str(entry["vine"]))
-        fitted = Number.from_json({str(k): v for k, v in entry.items()})
-        titles[key] = fitted.title
-        cells.setdefault(key, {})[str(entry["added"])] = quantity_text(fitted)
-    steps = list(dict.fromkeys(str(entry["added"]) for entry in entries))
-    head = ["Parameter", *map(_step, steps)]
-    rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
-    return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
-
-
-def law_rows(laws: pd.DataFrame | None) -> list[tuple[str, ...]]:
-    """Return the damping law from steady speeds with the pressure at the vine in each model."""
-    if laws is None or not len(laws):
-        return []
-    chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws
-    first = set(str(chosen["model"].iloc[0]).split("+"))
-    rows: list[tuple[str, ...]] = []
-    for entry in chosen.to_dict("records"):
-        added = [name for name in str(entry["model"]).split("+") if name not in first]
-        bounds = {key: [entry[f"{key}_low_95"], entry[f"{key}_high_95"]] for key in ("n", "B")}
-        row = (_step("+".join(added)), str(entry["vine"]), number(entry["n"], 4), interval(bounds["n"]))
-        rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
-    return rows
 
 
 # ------------------------------------------------------------------------------
@@ -561,7 +525,6 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
         known |= experiment.user_effects
-    moved, laws = (results.diagnosed(name) for name in ("moved.csv", "damping_laws.csv"))
     return {
         "name": experiment.name,
         "trials": trials,
@@ -579,8 +542,6 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "comparison": read_result(results.comparison),
         "check": read_result(results.model_check),
         "diagnosis": diagnosis,
-        "moved": read_result(moved) if moved.exists() else None,
-        "laws": read_result(laws) if laws.exists() else None,
         "effects": known,
         "sections": sections,
         "notes": experiment.blank_notes,
