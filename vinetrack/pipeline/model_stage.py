@@ -255,10 +255,10 @@ def propose_effect(
     diagnosis = read_diagnosis(results)
     if diagnosis is None:
         raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
-    if diagnosis.contradicted_columns:
+    if diagnosis.contradicted_columns or not diagnosis.verdict:
         raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
-        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.final_verdict)))
+        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
     pairs, _ = measured_trials(experiment, results)
     proposal = propose(model, pairs, report)
