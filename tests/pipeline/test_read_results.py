@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hand_diagnosis import VERDICTS, diagnosis, ladder, refused
+from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, refused
 
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
@@ -20,7 +20,7 @@ from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import published
-from vinetrack.pipeline.model_stage import propose_effect, sheet_contradictions, with_contradictions
+from vinetrack.pipeline.model_stage import _earlier_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
@@ -126,6 +126,19 @@ def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_th
     slow = found.where[found.where["condition"] == "slow"]
     assert slow[["growth_from", "growth_to"]].to_numpy().tolist() == [[0.0, 0.5], [0.5, 1.0]]
     assert slow[["misfit_m", "scatter_m", "n_trials"]].to_numpy().tolist() == [[0.011, 0.001, 2]] * 2
+
+
+def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_the_same_trials(tmp_path):
+    results = folder(tmp_path / "r", diagnosis())
+    grown = ladder("").assign(model="+".join([*BASE, "reservoir_depletion"]), added="")
+    assert not len(_earlier_steps(results, grown)), "of another error"
+    former = ladder("", "reservoir_depletion").assign(model=["+".join(BASE), grown["model"][0]])
+    former.to_csv(results.ladder, index=False)
+    earlier = _earlier_steps(results, grown.assign(rms_in_sample_m=former["rms_in_sample_m"][1]))
+    found = drawn.DiagnosisTables(
+        replace(read_diagnosis(results), ladder=grown), None, None, {"earlier_steps.csv": earlier}
+    )
+    assert found.ladder["added"].tolist() == ["", "reservoir_depletion"]
 
 
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):

@@ -57,9 +57,8 @@ def _check(experiment: Path) -> Answer:
     from vinetrack.pipeline.workflow import check_folder, find_experiment
 
     checked = check_folder(find_experiment(experiment))
-    lines = checked.lines()
-    if all(problem.severity == "note" for problem in checked.problems):
-        lines.append(f"{experiment}: no problems found.")
+    is_sound = all(problem.severity == "note" for problem in checked.problems)
+    lines = [*checked.lines(), *[f"{experiment}: no problems found."] * is_sound]
     return lines, checked.to_json(), checked.failed
 
 
@@ -92,8 +91,8 @@ def _run_lines(folder: Path) -> list[str]:
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
         failed = trials[trials["status"] == "failed"]
         more = f" (and {len(failed) - 1} more, see the report)" if len(failed) > 1 else ""
-        lines = [f"{row.trial} failed{more}: {row.reason}" for row in failed.head(1).itertuples()]
-        lines.append(f"Report: {results.report}")
+        first = (f"{row.trial} failed{more}: {row.reason}" for row in failed.head(1).itertuples())
+        lines = [*first, f"Report: {results.report}"]
         if diagnosis is None or not diagnosis.verdict:
             return [*lines, "" if diagnosis is None else diagnosis.explanation]
         lines += table_lines(diagnosis, in_short=True)

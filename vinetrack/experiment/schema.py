@@ -191,8 +191,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         return ""
     if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
         return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
-    others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
-    return f"did you mean {nearest[0]}?{others}"
+    return f"did you mean {nearest[0]}?"
 
 
 # ------------------------------------------------------------------------------

@@ -425,10 +425,11 @@ def list_pictures(folder: Path) -> list[str]:
 
 
 TABLES = (".csv", ".txt", ".tsv", ".trk")  # Endings of files that may be tracks
+NOTES = (".txt", ".md", ".tsv", ".csv")  # and of notes on the recordings
 
 
 def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
-    """Return tables with these endings, which may be pressure traces, as paths relative to the folder."""
+    """Return files with these endings, such as pressure traces, as paths relative to the folder."""
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
     names = (path.relative_to(folder).as_posix() for path in tables)
@@ -443,12 +444,6 @@ def list_tracks(folder: Path) -> list[str]:
             read_track(folder / name, capture_fps=1.0, m_per_px=1e-3)
             found.append(name)
     return found
-
-
-def list_notes(folder: Path) -> list[str]:
-    """Return the files that may be notes on the recordings, by name."""
-    names = [path.name for path in entries(folder) if path.suffix.lower() in (".txt", ".md", ".tsv", ".csv")]
-    return sorted((name for name in names if name not in FILES), key=natural_order)
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:

@@ -184,11 +184,7 @@ class Page:
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
         buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
-        hint = Div(
-            text="<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps "
-            "this model for comparison.</small>"
-        )
-        actions = Column(buttons, hint, name="actions")
+        actions = Column(buttons, name="actions")
         texts = [self.headline, self.status, self.numbers, self.tied, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
         panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import to_json
 from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
@@ -31,12 +32,12 @@ from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read
 from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.style import render
 from vinetrack.pages.draft_files import (
+    NOTES,
     Draft,
     cells_of,
     column_of,
     draft_folder,
     files_stamp,
-    list_notes,
     list_pictures,
     list_tables,
     open_draft,
@@ -109,7 +110,7 @@ def axis_json(axis: Axis) -> dict[str, Any]:
         # 4.0: spacing of the points of a curve sent to the page, px (chosen)
         along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / 4.0)))
         entry["path_px"] = axis.points(along).round(2).tolist()
-    return {**entry, "width_px": _rounded(axis.width_px, 2)}
+    return {**entry, "width_px": round(axis.width_px, 2)}
 
 
 def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
@@ -153,13 +154,13 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
         "frames": [int(tracking.strip_rows[0]), int(tracking.strip_rows[-1])],
         "length_px": round(tracking.axis.length_px, 2),
         "axis": axis_json(tracking.axis),
-        "time_s": _numbers(track.time_s, 6),
-        "edge_px": _numbers(track.edge_px, 2),
-        "position_mm": _numbers(1e3 * track.lead_position_m, 3),
+        "time_s": np.round(track.time_s, 6).tolist(),
+        "edge_px": np.round(track.edge_px, 2).tolist(),
+        "position_mm": np.round(1e3 * track.lead_position_m, 3).tolist(),
         "flag": [str(flag) for flag in track.flag],
-        "shake_px": _numbers(tracking.shake_px, 2),
-        "growth_mm": _rounded(facts.growth_mm, 2),
-        "tube_width_mm": _rounded(mm_per_px * tracking.tube_width_px, 2),
+        "shake_px": np.round(tracking.shake_px, 2).tolist(),
+        "growth_mm": round(facts.growth_mm, 2),
+        "tube_width_mm": round(mm_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
         "notes": [*notes, *track.notes],
@@ -173,15 +174,6 @@ def _strip_url(fig: Figure) -> str:
         svg = svg.replace(colour, f"var({token})")
     svg = svg.replace("<defs>", f"<style>{TOKENS_CSS.read_text(encoding='utf-8')}</style><defs>", 1)
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-
-
-def _numbers(values: NDArray[Any], digits: int) -> list[float | None]:
-    return [_rounded(float(value), digits) for value in values]
-
-
-def _rounded(value: float, digits: int) -> float | None:
-    """A number for JSON, None for NaN."""
-    return round(value, digits) if math.isfinite(value) else None
 
 
 # ------------------------------------------------------------------------------
@@ -215,12 +207,12 @@ def page_state(folder: Path) -> dict[str, Any]:
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
         "corrections": {
-            trial: [vars(point) | {"edge_px": _rounded(point.edge_px, 2)} for point in given]
+            trial: [vars(point) | {"edge_px": round(point.edge_px, 2)} for point in given]
             for trial, given in draft.corrections.items()
         },
         "pictures": list_pictures(folder),
         "traces": list_tables(folder),
-        "notes": list_notes(folder),
+        "notes": list_tables(folder, NOTES),
     }
 
 
@@ -404,7 +396,7 @@ class _Answer(_Quiet):
             content = {"words": f"{type(error).__name__}: {error}"}
         kinds: dict[type, str] = {bytes: "image/jpeg", str: "text/css; charset=utf-8"}
         self.set_header("Content-Type", kinds.get(type(content), "application/json"))
-        self.finish(content if isinstance(content, bytes | str) else json.dumps(content, ensure_ascii=False))
+        self.finish(content if isinstance(content, bytes | str) else to_json(content, inf_nan_mode="null"))
 
 
 def start_server(desk: Desk, port: int | None = None) -> PageServer:

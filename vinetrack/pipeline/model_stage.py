@@ -49,7 +49,15 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    measured_trials,
+    read_diagnosis,
+    read_json,
+    read_result,
+    table_of,
+)
 from vinetrack.tracks.frame_timing import mean_speed
 
 if TYPE_CHECKING:
@@ -185,8 +193,9 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
+    ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
+    tables = diagnosis_tables(diagnosis) | {"earlier_steps.csv": _earlier_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
-    tables = diagnosis_tables(diagnosis)
     tables |= {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
@@ -196,9 +205,22 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_csv(folder / name, table)
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
-    write_csv(results.ladder, table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
+    write_csv(results.ladder, ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
+
+
+def _earlier_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+    """Return the steps by which earlier runs came to the model that is now in use: the rows of their ladder above that
+    of this model, if its error there is the same, so that it is of the same trials.
+    """
+    paths = (results.diagnosed("earlier_steps.csv"), results.ladder)
+    rows: list[Any] = [row for path in paths if path.exists() for row in read_result(path).to_dict("records")]
+    for now in ladder.to_dict("records")[:1]:
+        for k, row in enumerate(rows):
+            if row["model"] == now["model"] and np.isclose(row["rms_in_sample_m"], now["rms_in_sample_m"], 1e-3, 0.0):
+                return table_of(LADDER_COLUMNS, rows[:k])
+    return table_of(LADDER_COLUMNS)
 
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:

@@ -32,6 +32,8 @@ class DiagnosisTables:
         self, diagnosis: Diagnosis | None = None, conditions: pd.DataFrame | None = None,
         trials: pd.DataFrame | None = None, tables: Mapping[str, pd.DataFrame] | None = None,
     ) -> None:  # fmt: skip
+        import pandas as pd
+
         found, none, rounds = tables or {}, table_of(()), diagnosis.rounds if diagnosis else ()
         named = table_of(("condition", "condition_label")) if conditions is None else conditions
         labels = dict(zip(named["condition"].astype(str), named["condition_label"].astype(str), strict=True))
@@ -41,6 +43,10 @@ class DiagnosisTables:
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
         self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
+        if len(earlier := found.get("earlier_steps.csv", none)):  # of earlier runs, before effects were saved
+            before, now = (table["model"].iloc[place].split("+") for table, place in ((earlier, -1), (self.ladder, 0)))
+            added = ["+".join(name for name in now if name not in before), *self.ladder["added"][1:]]
+            self.ladder = pd.concat([earlier, self.ladder.assign(added=added)], ignore_index=True)
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
