@@ -19,7 +19,6 @@ from vinetrack.cli.options import MORE, START, Answer, command
 from vinetrack.core.problems import UserError
 from vinetrack.core.tables import safe_join, write_csv, write_text
 from vinetrack.core.terminal import table, waiting
-from vinetrack.core.units import number
 from vinetrack.pipeline.stages import STAGES, Job, Kept, Stage, code_hash, compilation_told, identity
 
 if TYPE_CHECKING:
@@ -177,19 +176,14 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 @command()
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
+    from vinetrack.diagnosis.ladder import comparison_lines
     from vinetrack.results.folder_layout import Results, read_fit, read_result
 
     fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
     content = compared.to_dict("records")
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"], content
-    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
-    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
-    shown = (compared[[*scale]] * [*scale.values()]).map(number)
-    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
-    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
-    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
-    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)], content
+    return [*comparison_lines(compared), *(f"! {message}" for message in fit.messages)], content
 
 
 @command()
