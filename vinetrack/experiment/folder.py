@@ -55,17 +55,11 @@ class Experiment:
     @property
     def blank_notes(self) -> list[str]:
         """Sentences that state which default blank cells stand for, where it affects the physics."""
-        blank, notes = [name for name in self.angle_blank if name not in self.left_out], []
-        if blank:
-            which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
-            notes = [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
-        correlation = order_pressure_correlation(self.trials)
-        if abs(correlation) >= CONFOUNDED and not trial_order(self.trials)[1]:
-            notes.append(
-                f"order is blank: taken as that of the rows, which follows the pressure ({correlation:.2f}), so that a "
-                "drift would look like a physical effect; number the trials as they were run"
-            )
-        return notes
+        blank = [name for name in self.angle_blank if name not in self.left_out]
+        if not blank:
+            return []
+        which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
+        return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
 
     @property
     def user_effects(self) -> Mapping[str, Effect]:
@@ -165,10 +159,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     """Read the sheet as a table and check its columns."""
-    remedy = (
-        f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
-        "creates both from a folder of recordings"
-    )
+    remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         raise ExperimentError([Problem("no_folder", message, file=str(folder), remedy=remedy)])
@@ -397,8 +388,6 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
 # A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
 # rises with the order, the data cannot distinguish such a drift from an effect of pressure.
 
-CONFOUNDED = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
-
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     """Return the rank of every trial, from 0, as they were run, shape (n_trials,), and whether the sheet says so."""
@@ -427,13 +416,14 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
     """Warn of confounding: order with pressure, and specimen or day with condition."""
     from pandas import DataFrame
 
-    correlation = order_pressure_correlation(trials)
-    if abs(correlation) >= CONFOUNDED and trial_order(trials)[1]:
-        message = (
-            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
-        )
-        remedy = "run the trials in random order, or repeat six of them in random order"
-        yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
+    correlation, (_, stated) = order_pressure_correlation(trials), trial_order(trials)
+    # 0.7: rank correlation above which order and pressure count as confounded (derived)
+    if abs(correlation) >= 0.7:
+        said = "" if stated else "is blank: taken as that of the rows, which "
+        message = f"{said}follows the pressure (rank correlation {correlation:.2f}): a drift would look like an effect"
+        remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
+        severity = "warning" if stated else "note"
+        yield Problem("confounded", message, "order", file=SHEET, severity=severity, remedy=remedy)
     frame = DataFrame(map(vars, trials), columns=["vine", "condition", *GROUPINGS])
     for column in GROUPINGS if trials else ():
         # Every condition has a single specimen or day, while they differ within a vine.
@@ -515,12 +505,10 @@ def _check_track(trial: Trial) -> list[Problem]:
 
 def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
     """Check that a recording exists and is not empty; `named_videos` are the recordings named by any trial."""
-    code, message, remedy = "empty", "is an empty file", "copy it again"
+    code, message, remedy = "empty", "is empty", "copy it again"
     try:
         if any(path.iterdir()) if path.is_dir() else tables.file_size(path):
             return []
-        if path.is_dir():
-            message, remedy = "is an empty folder", "put the frames in it"
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", tables.missing_file_message(path)
         if not path.is_symlink() and (close := closest_entry(path, named_videos)):

@@ -496,11 +496,9 @@ def reference_page() -> str:
     page = """\
 # Every column and key
 
-Generated from the declarations that validate them: `vinetrack settings` prints the same,
-`vinetrack settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md`
-writes this page. A column, or a key of `experiment.yaml`, may state another unit in its name
-(`pressure_psi`, `diameter_in`, …): it is converted, as `vinetrack check` says; pages show pressures in it.
-A blank cell means the default.
+Printed by `vinetrack settings`, also with `--json -`; `--page docs/settings.md` writes this page. A column, or a key of
+`experiment.yaml`, may state another unit in its name (`pressure_psi`, `diameter_in`, …): it is converted, as `vinetrack
+check` says; pages show pressures in it. A blank cell means the default.
 """
     for _, title, entries in _groups():
         heading, _, shared = title.partition("; ")

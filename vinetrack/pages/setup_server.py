@@ -244,8 +244,8 @@ def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[s
         checked = check_folder(copy) if thorough else None
         problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
     return {
-        # The unit of a column was chosen on the page.
-        "problems": [_problem_json(problem, draft.sheet.columns) for problem in problems if problem.code != "unit"],
+        # What is noted, such as a unit, was chosen on the page.
+        "problems": [_problem_json(one, draft.sheet.columns) for one in problems if one.severity != "note"],
         "notes": list(checked.notes) if checked else [],
         "understood": list(checked.recording_lines) if checked else [],
         "texts": draft.texts() | ({} if draft.corrections else {CORRECTIONS_FILE: ""}),
