@@ -147,8 +147,7 @@ class FigureTables:
         """Measured and modelled growth of all trials, at most 1000 rows (chosen) at an even stride."""
         import pandas as pd
 
-        conditions = read_result(self.results.comparison)["condition"]
-        parts = [read_result(self.results.trajectories(name)).assign(condition=name) for name in conditions]
+        parts = [table.assign(condition=name) for name, table in self.trajectories.items()]
         whole = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         return whole.iloc[:: -(-len(whole) // 1000) or 1]
 

@@ -19,6 +19,7 @@ from tornado.ioloop import IOLoop
 
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
+from vinetrack.core.units import number
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
@@ -81,7 +82,7 @@ def headline(
 
 
 def _in_mm(value_m: float) -> str:
-    return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
+    return f"{number(1e3 * value_m)} mm" if math.isfinite(value_m) else ""
 
 
 def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Number]) -> dict[str, str]:
@@ -127,13 +128,8 @@ def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
 def fit_progress(task: str, step: Step | None, since_s: float) -> str:
     """Return a progress bar of a fit whose number of steps is unknown, as HTML."""
     done = 0 if step is None else step.iteration
-    if step is not None:
-        task += f" · step {done}"
-        if math.isfinite(step.predicted_decrease):
-            gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
-            task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
     # 5: steps after which the bar is half full (chosen)
-    return progress_bar(done / (done + 5), f"{task} · {since_s:.1f} s")
+    return progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
 
 
 # ------------------------------------------------------------------------------

@@ -428,10 +428,9 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     written = write_draft(folder, draft)
     columns, added = draft.sheet.columns, draft.sheet.rows[len(present.rows) :]
     filled = [name for name in columns if name not in ("trial", "video", "track") and any(r.get(name) for r in added)]
-    for name in written:
-        say(f"Written: {folder / name}")
-    if not written:
-        say(f"{SHEET} and {SETTINGS} of {folder} already contain every recording.")
+    there = f"{SHEET} and {SETTINGS} of {folder} already contain every recording."
+    for line in [f"Written: {folder / name}" for name in written] or [there]:
+        say(line)
     named = f", {len(added)} of them new; from their names: {', '.join(filled) or 'nothing'}" if added else ""
     say(f"{len(draft.sheet.rows)} trials{named}.")
     problems = [*check_experiment(folder), *_scale_missing(draft)]

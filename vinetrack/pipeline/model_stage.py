@@ -194,7 +194,7 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
-    tables = diagnosis_tables(diagnosis) | {"earlier_steps.csv": _earlier_steps(results, ladder)}
+    tables = diagnosis_tables(diagnosis) | {"steps.csv": _all_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
     tables |= {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     if len(diagnosis.fits) > 1:
@@ -210,17 +210,18 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
 
 
-def _earlier_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
-    """Return the steps by which earlier runs came to the model that is now in use: the rows of their ladder above that
-    of this model, if its error there is the same, so that it is of the same trials.
+def _all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+    """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
+    if its error there is the same, so that it is of the same trials.
     """
-    paths = (results.diagnosed("earlier_steps.csv"), results.ladder)
-    rows: list[Any] = [row for path in paths if path.exists() for row in read_result(path).to_dict("records")]
-    for now in ladder.to_dict("records")[:1]:
-        for k, row in enumerate(rows):
-            if row["model"] == now["model"] and np.isclose(row["rms_in_sample_m"], now["rms_in_sample_m"], 1e-3, 0.0):
-                return table_of(LADDER_COLUMNS, rows[:k])
-    return table_of(LADDER_COLUMNS)
+    import pandas as pd
+
+    former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
+    for k, row in enumerate(former.to_dict("records") if len(ladder) else ()):
+        now = ladder.iloc[0]
+        if row["model"] == now["model"] and np.isclose(row["rms_in_sample_m"], now["rms_in_sample_m"], 1e-3, 0.0):
+            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
+    return ladder
 
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:

@@ -218,7 +218,7 @@ def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of a check: `problems`, facts about each recording or track (`recordings`, also as lines), and `notes`."""
+    """Result of a check: `problems`, facts about each recording (`recordings`, also as lines), and `notes`."""
 
     problems: tuple[Problem, ...]
     recordings: tuple[dict[str, Any], ...]
@@ -245,7 +245,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
-    from vinetrack.tracks.importers import load_track, track_facts, track_lines
+    from vinetrack.tracks.importers import load_track, track_lines
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
     from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
@@ -268,7 +268,6 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
         problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
     lines = facts_rows(entries, list(surveyor.facts)) if entries else []
-    imported = [track_facts(*pair) for pair in tracks]
     if 0 < len(surveyor.looked_into) < len(entries):
         lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")
     notes = list(experiment.blank_notes)
@@ -277,8 +276,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         notes.append(str(remark("smoothed", how=str(smoothing), frames=smoothing.decimation)))
     if rounding_m > 0:
         notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
-    facts = (*map(facts_entry, entries), *imported)
-    return CheckReport(tuple(problems), facts, (*lines, *track_lines(imported)), tuple(notes))
+    return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), (*lines, *track_lines(tracks)), tuple(notes))
 
 
 def model_problems(experiment: Experiment) -> list[Problem]:

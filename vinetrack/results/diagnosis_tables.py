@@ -32,8 +32,6 @@ class DiagnosisTables:
         self, diagnosis: Diagnosis | None = None, conditions: pd.DataFrame | None = None,
         trials: pd.DataFrame | None = None, tables: Mapping[str, pd.DataFrame] | None = None,
     ) -> None:  # fmt: skip
-        import pandas as pd
-
         found, none, rounds = tables or {}, table_of(()), diagnosis.rounds if diagnosis else ()
         named = table_of(("condition", "condition_label")) if conditions is None else conditions
         labels = dict(zip(named["condition"].astype(str), named["condition_label"].astype(str), strict=True))
@@ -42,11 +40,8 @@ class DiagnosisTables:
         self.worst = labels.get(worst, worst)
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
-        self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
-        if len(earlier := found.get("earlier_steps.csv", none)):  # of earlier runs, before effects were saved
-            before, now = (table["model"].iloc[place].split("+") for table, place in ((earlier, -1), (self.ladder, 0)))
-            added = ["+".join(name for name in now if name not in before), *self.ladder["added"][1:]]
-            self.ladder = pd.concat([earlier, self.ladder.assign(added=added)], ignore_index=True)
+        ladder = None if diagnosis is None else diagnosis.ladder
+        self.ladder = none if ladder is None else found.get("steps.csv", ladder)
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
@@ -54,9 +49,8 @@ class DiagnosisTables:
         self.rounds: list[tuple[str, pd.DataFrame]] = []
         for i, ranked in enumerate(rounds):
             more = [name for name in ranked.model if name not in rounds[0].model]
-            heading = f"Which is missing with {listed_names(more)} added?"
-            heading = heading if i else "Which effect is missing from the initial model?"
-            self.rounds.append((heading, self.ranking[self.ranking["round"] == i + 1]))
+            heading = f"is missing with {listed_names(more)} added" if i else "effect is missing from the initial model"
+            self.rounds.append((f"Which {heading}?", self.ranking[self.ranking["round"] == i + 1]))
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:

@@ -10,7 +10,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -532,22 +532,16 @@ def read_track(
     return track.flagged(before, "rejected").flagged(after, "after_end")
 
 
-def track_facts(trial: Trial, track: Track) -> dict[str, Any]:
-    """What was read of a track, by names with units."""
-    step_s, time_s = float(np.median(np.diff(track.time_s))), track.time_s
-    travel_mm = 1e3 * float(np.ptp(track.lead_position_m[track.usable]))
-    facts = {"trial": trial.name, "n_points": time_s.size, "rate_fps": 1 / step_s, "duration_s": np.ptp(time_s)}
-    return facts | {"growth_mm": travel_mm, "length_mm": 1e3 * trial.length_m, "notes": list(track.notes)}
-
-
-def track_lines(facts: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Facts of tracks as a table, and their notes; of those that differ only in numbers, the first."""
-    rows = [(one["trial"], one["n_points"], *(number(v, 4) for v in list(one.values())[2:-1])) for one in facts]
+def track_lines(tracks: Iterable[tuple[Trial, Track]]) -> list[str]:
+    """What was read of tracks as a table, and their notes; of those that differ only in numbers, the first."""
+    rows, told = [], dict[str, list[str]]()
+    for trial, track in tracks:
+        time_s, growth_m = track.time_s, float(np.ptp(track.lead_position_m[track.usable]))
+        facts = 1 / float(np.median(np.diff(time_s))), np.ptp(time_s), 1e3 * growth_m, 1e3 * trial.length_m
+        rows.append((trial.name, time_s.size, *(number(float(fact), 4) for fact in facts)))
+        for note in track.notes:
+            told.setdefault(re.sub(r"\d[\d.]*", "", note), []).append(f"{trial.name}: {note}")
     head, units = ("track", "points", "rate", "lasts", "growth", "sheet"), ("", "", "1/s", "s", "mm", "mm")
-    told: dict[str, list[str]] = {}
-    for one in facts:
-        for note in one["notes"]:
-            told.setdefault(re.sub(r"\d[\d.]*", "", note), []).append(f"{one['trial']}: {note}")
     lines = [f"{alike[0]}{f' (and {len(alike) - 1} more alike)' if alike[1:] else ''}" for alike in told.values()]
     return [*table(rows, head, units, align="<>>>>>"), *lines] if rows else []
 
