@@ -75,9 +75,8 @@ def draw_trial_motion(
             strip.fill(ends_s, i - 0.28, i + 0.28, facecolor=fill, edgecolor=colour, lw=1.3)
         else:
             strip.plot(over, [i, i], color=st.GRID, lw=1, ls=":")
-        strip.write(
-            over[0], i, "by hand" if row.rule == "user" else row.rule, (-3.5, 0), ha="right", va="center", fontsize=9
-        )
+        name = "by hand" if row.rule == "user" else row.rule
+        strip.write(over[0], i, name, (-3.5, 0), ha="right", va="center", fontsize=9)
 
     lead.scale("left", "leading edge (mm)")
     speed.scale("left", "leading edge (m/s)")

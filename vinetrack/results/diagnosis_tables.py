@@ -40,8 +40,7 @@ class DiagnosisTables:
         self.worst = labels.get(worst, worst)
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
-        ladder = None if diagnosis is None else diagnosis.ladder
-        self.ladder = none if ladder is None else found.get("steps.csv", ladder)
+        self.ladder = none if (ladder := diagnosis and diagnosis.ladder) is None else found.get("steps.csv", ladder)
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
