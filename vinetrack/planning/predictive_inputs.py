@@ -592,11 +592,8 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
         return []
     psi, stated = convert(1.0, "psi", "kPa"), pairs[0][0].pressure_unit
     factor, right, wrong = (psi, "psi", "kPa") if as_stated < 1 else (1 / psi, "kPa", "psi")
-    other_unit = (
-        f"{right}, not {wrong} (1 psi is {psi:.4g} kPa)",
-        "in the other unit",
-        f"name the column pressure_{right}",
-    )
+    how_much = f"(1 psi is {psi:.4g} kPa)"
+    other_unit = f"{right}, not {wrong} {how_much}", "in the other unit", f"name the column pressure_{right}"
     absolute = (
         "absolute pressure",
         "after the ambient pressure is subtracted",
