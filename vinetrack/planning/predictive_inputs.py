@@ -594,11 +594,7 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     factor, right, wrong = (psi, "psi", "kPa") if as_stated < 1 else (1 / psi, "kPa", "psi")
     how_much = f"(1 psi is {psi:.4g} kPa)"
     other_unit = f"{right}, not {wrong} {how_much}", "in the other unit", f"name the column pressure_{right}"
-    absolute = (
-        "absolute pressure",
-        "after the ambient pressure is subtracted",
-        "state gauge pressure, relative to the ambient pressure",
-    )
+    absolute = "absolute pressure", "after the ambient pressure is subtracted", "state gauge pressure"
     gauge = [(replace(t, pressure_Pa=t.pressure_Pa - t.ambient_pressure_Pa), speed) for t, speed in pairs]
     converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs if stated == wrong]
     with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
