@@ -49,5 +49,5 @@ $(STAMP): requirements.lock pyproject.toml
 	echo "Setting up .venv with $$("$$python" --version), about a minute the first time."; \
 	rm -f $(STAMP); $(BIN)/python -c '' 2>/dev/null || "$$python" -m venv --clear .venv
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $(STAMP)

@@ -209,7 +209,7 @@ def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
     assert trial.payload_kg == pytest.approx(0.05669904625, rel=1e-14)
     assert (trial.pressure_Pa, trial.yield_pressure_Pa) == pytest.approx((4 * PSI, 0.435 * PSI), rel=1e-12)
     said = {problem.column: problem for problem in read.problems}
-    assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "warning")}
+    assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "note")}
     assert said.keys() == {"diameter_in", "pressure_psi", "payload_oz", "yield_pressure_psi"}
     assert "6.89476" in said["pressure_psi"].message
     pressure = pressure_text(trial.pressure_Pa, trial.pressure_unit)

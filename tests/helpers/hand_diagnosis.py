@@ -100,11 +100,3 @@ def ladder(*added: str) -> pd.DataFrame:
         for i, name in enumerate(added)
     ]
     return pd.DataFrame(rows)
-
-
-def moved() -> pd.DataFrame:
-    n = {"model": "m", "vine": "", "unit": "1", "symbol": "n", "parameter": "eversion_damping.n", "added": ""}
-    n |= {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52}
-    after = n | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38}
-    gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "value": 1.17, "low_95": 1.16, "high_95": 1.18}
-    return pd.DataFrame([n, after, after | gamma])

@@ -433,7 +433,7 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign, tmp_p
         results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
         return recording_view(results, trial)
 
-    assert "run snakemake again" in str(along())
+    assert "run `vinetrack run` again" in str(along())
     found = along(from_px=[0, 10], to_px=[300, 10], width_px=None)
     assert isinstance(found, RecordingView)
     assert found.half_width_px == pytest.approx(15.0)

@@ -45,6 +45,7 @@ NAMES = {
     "d12/24kPa/1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"},
     "d12/d24_1.mp4": {"diameter_mm": "24"},
     "GX010042.mp4": {},
+    "p24kPa_t1.mp4": {"pressure_kPa": "24"},
     "2024-05-01 17.22.mp4": {},
     "day3_tube2.mp4": {"day": "3", "specimen": "2"},
 }  # fmt: skip

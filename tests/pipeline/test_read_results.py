@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, refused
+from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, refused
 
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
@@ -20,7 +20,7 @@ from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import published
-from vinetrack.pipeline.model_stage import propose_effect, sheet_contradictions, with_contradictions
+from vinetrack.pipeline.model_stage import _all_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
@@ -49,7 +49,7 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
     assert str(back) == str(fit)
     for content in ("[]", '{"model": 3}', '{"numbers": [1]}'):
         results.fit.write_text(content, encoding="utf-8")
-        with pytest.raises(ResultsError, match="delete it and run snakemake again"):
+        with pytest.raises(ResultsError, match="delete it and run `vinetrack run` again"):
             read_fit(results)
 
 
@@ -93,7 +93,6 @@ def folder(path: Path, content: dict | None, after: bool = True) -> Results:
     if content is not None:
         (path / "diagnosis.json").write_text(json.dumps(content))
     ladder("", *content.get("effects", []) if content else ()).to_csv(results.ladder, index=False)
-    moved().to_csv(results.diagnosed("moved.csv"), index=False)
     for condition in ("slow", "fast"):
         parts = []
         for trial in (t for t, c in TRIALS.items() if c == condition):
@@ -127,6 +126,17 @@ def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_th
     slow = found.where[found.where["condition"] == "slow"]
     assert slow[["growth_from", "growth_to"]].to_numpy().tolist() == [[0.0, 0.5], [0.5, 1.0]]
     assert slow[["misfit_m", "scatter_m", "n_trials"]].to_numpy().tolist() == [[0.011, 0.001, 2]] * 2
+
+
+def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_the_same_trials(tmp_path):
+    results = folder(tmp_path / "r", diagnosis())
+    former = ladder("", "leak").assign(model=["+".join(BASE), "+".join([*BASE, "leak"])])
+    former.to_csv(results.ladder, index=False)
+    now = former[1:].assign(added="").reset_index(drop=True)
+    assert _all_steps(results, now)["added"].tolist() == ["", "leak"]
+    assert _all_steps(results, now.assign(rms_in_sample_m=1.0))["added"].tolist() == [""], "of other trials"
+    read = replace(read_diagnosis(results), ladder=now)
+    assert len(drawn.DiagnosisTables(read, tables={"steps.csv": _all_steps(results, now)}).ladder) == 2
 
 
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):

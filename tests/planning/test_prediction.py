@@ -215,6 +215,7 @@ PSI = 6.894757
         (1.0, 1 / PSI, 1.0, 0.0, "psi, not kPa"),
         (1.0, 1 / PSI, 1 / PSI, 0.0, "psi, not kPa"),
         (1.0, PSI, 1.0, 0.0, "kPa, not psi"),
+        (1.0, PSI, 1.0, 0.0, ""),  # in kPa, as the sheet says: a tube of strong damping
         (1.0, 1.0, 1.0, 101_325.0, "absolute pressure"),
     ],
 )
@@ -224,6 +225,7 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_no_right_one(damping, factor,
     pairs = [(ball, 2.0)]
     for P in (24e3, 30e3, 60e3):
         stated = {"pressure_Pa": factor * P + added_Pa, "yield_pressure_Pa": yield_factor * 3e3}
+        stated |= {"pressure_unit": "psi" if suspected == "kPa, not psi" else "kPa"}
         one = Trial(name=f"t{P:g}", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, **stated)
         tail = ((P - 3e3) * one.area_m2 / (damping * damping_prior(0.012, 1e-4))) ** (1 / published.EXPONENT)
         pairs.append((one, tail / 2))

@@ -64,7 +64,6 @@ HEADER = "time_s,position_m\n"
 NO_TRACKS = [
     "",
     HEADER + "1,1\n2,2\n3,3\n4,4\n",
-    "time_s,position_mm\n" + rows(TIMES, POSITIONS),
     "frame,position_m\n" + rows(TIMES, POSITIONS),
     *(HEADER + f"0,0\n1,1\n{row}\n2,3\n3,4\n" for row in ("1,2", "1.5,x", "1.5,", "1.5,nan", "1.5,1e300")),
     "time_s,position_m,sigma_m\n0,0,1\n1,1,-1\n2,2,1\n3,3,1\n4,4,1\n",
@@ -92,6 +91,8 @@ def test_an_invalid_track_is_refused(tmp_path, text):
         ("mass A\n\nt (s)\tx (m)\ty (m)\n", "\t", ".", (1, -0.6, 0.8)),
         ("ball\nt\ty\n", "\t", ".", (1, -1)),
         ("t (ms)\tx (cm)\n", "\t", ".", (1000, 100)),
+        ("time_ms,position_mm\n", ",", ".", (1000, 1000)),
+        ("time,position\n", ",", ".", (1, 1)),
     ],
 )
 def test_exports_of_a_straight_motion(tmp_path, header, separator, decimal, scales):
@@ -120,6 +121,7 @@ FOREIGN = {
     + "".join(f"{i / FPS:.4f} {x} {y}\n" for i, (x, y) in enumerate(PIXELS)),
     "DLTdv": "pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y\nNaN,NaN,NaN,NaN\n"
     + "".join(f"{x},{y},NaN,NaN\n" for x, y in PIXELS),
+    "Tracker in pixels": "mass_A,,\nt,x,y\n" + "".join(f"{i / FPS},{x},{y}\n" for i, (x, y) in enumerate(PIXELS)),
     "pixels by name": "t,x (px),y (px)\n" + "".join(f"{i / FPS},{x},{y}\n" for i, (x, y) in enumerate(PIXELS)),
     "DLTdv in space": "pt1_X,pt1_Y,pt1_Z\n" + "".join(f"{0.6 * x},{y},{0.8 * x}\n" for x, y in PIXELS),
 }
@@ -134,7 +136,7 @@ def test_a_table_of_another_program_is_read_with_rate_and_scale_of_the_sheet(tmp
     np.testing.assert_allclose(np.diff(track.time_s), 1 / FPS, atol=1e-9)
     np.testing.assert_allclose(np.ptp(track.lead_position_m[found]), np.ptp(GROWN_M), rtol=1e-5)
     np.testing.assert_allclose(np.diff(track.lead_position_m[found]), np.diff(GROWN_M), atol=1e-9)
-    if "Kinovea" not in name and name != "pixels by name":
+    if not name.startswith(("Kinovea", "Tracker", "pixels")):
         with pytest.raises(InputError, match="capture_fps"):
             read_track(path)
     with pytest.raises(InputError):

@@ -219,7 +219,7 @@ def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
         (RIGHT, FILMED.replace("0.24", "0.288"), ["warning t0 diameter_mm"]),
         ("140,100,12,36,3", FILMED, ["error t0 diameter_mm", "error t0 length_mm"]),
         (RIGHT, FILMED + "exposure_us: 0.0935\n", ["warning exposure_us", "warning t0 exposure_us"]),
-        (RIGHT, FILMED + "exposure_ms: 93.5\n", ["warning exposure_ms", "error t0 exposure_us"]),
+        (RIGHT, FILMED + "exposure_ms: 93.5\n", ["note exposure_ms", "error t0 exposure_us"]),
     ],
     ids=["rate", "scale ×10", "scale 20 %", "sizes swapped", "ms as µs", "µs as ms"],
 )

@@ -19,7 +19,6 @@ from vinetrack.cli.options import MORE, START, Answer, command
 from vinetrack.core.problems import UserError
 from vinetrack.core.tables import safe_join, write_csv, write_text
 from vinetrack.core.terminal import table, waiting
-from vinetrack.core.units import number
 from vinetrack.pipeline.stages import STAGES, Job, Kept, Stage, code_hash, compilation_told, identity
 
 if TYPE_CHECKING:
@@ -57,7 +56,8 @@ def _check(experiment: Path) -> Answer:
     from vinetrack.pipeline.workflow import check_folder, find_experiment
 
     checked = check_folder(find_experiment(experiment))
-    lines = checked.lines() if checked.problems else [*checked.lines(), f"{experiment}: no problems found."]
+    is_sound = all(problem.severity == "note" for problem in checked.problems)
+    lines = [*checked.lines(), *[f"{experiment}: no problems found."] * is_sound]
     return lines, checked.to_json(), checked.failed
 
 
@@ -76,8 +76,8 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
 
 
 def _run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
-    are kept, since reading a diagnosis takes most of a second.
+    """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last.
+    They are kept, since reading a diagnosis takes most of a second.
     """
     from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
 
@@ -89,13 +89,13 @@ def _run_lines(folder: Path) -> list[str]:
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
         failed = trials[trials["status"] == "failed"]
-        lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
-        lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-        lines.append(f"Report: {results.report}")
+        more = f" (and {len(failed) - 1} more, see the report)" if len(failed) > 1 else ""
+        first = (f"{row.trial} failed{more}: {row.reason}" for row in failed.head(1).itertuples())
+        lines = [*first, f"Report: {results.report}"]
         if diagnosis is None or not diagnosis.verdict:
             return [*lines, "" if diagnosis is None else diagnosis.explanation]
-        notes = [f"! {note}" for note in diagnosis.notes[:1]]
-        return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
+        lines += table_lines(diagnosis, in_short=True)
+        return [*lines, *(f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11), verdict_line(diagnosis)]
 
     state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
     return Kept(folder).made("lines", state, summary)
@@ -176,19 +176,14 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 @command()
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
+    from vinetrack.diagnosis.ladder import comparison_lines
     from vinetrack.results.folder_layout import Results, read_fit, read_result
 
     fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
     content = compared.to_dict("records")
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"], content
-    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
-    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
-    shown = (compared[[*scale]] * [*scale.values()]).map(number)
-    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
-    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
-    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
-    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)], content
+    return [*comparison_lines(compared), *(f"! {message}" for message in fit.messages)], content
 
 
 @command()

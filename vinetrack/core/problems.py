@@ -17,9 +17,9 @@ INTERNAL_ERROR = "an internal error of the program; the traceback is in the log 
 
 @dataclass(frozen=True)
 class Problem:
-    """An error or a warning (`severity`): location, given value, allowed values, and remedy. `file` is relative to the
-    experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if they do not apply. `value`
-    is None if there is none, "" for a blank cell. `code` says for a program what `message` says for a person.
+    """An error, a warning or a note (`severity`): location, given value, allowed values, and remedy. `file` is relative
+    to the experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if they do not apply.
+    `value` is None if there is none, "" for a blank cell. `code` says for a program what `message` says for a person.
     """
 
     code: str = ""
@@ -86,7 +86,7 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Format problems, errors first and shared ones once, as at most `limit` lines; the last counts the rest."""
     groups: dict[Problem, list[Problem]] = {}
     # Those that differ only in trial, line and measured number are one.
-    for problem in sorted(problems, key=lambda problem: problem.severity != "error"):
+    for problem in sorted(problems, key=lambda problem: ("error", "warning", "note").index(problem.severity)):
         message = "" if problem.of_a_measurement else problem.message
         groups.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
     merged = [

@@ -20,8 +20,9 @@ import numpy as np
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Kinematics, Track
-from vinetrack.core.terminal import plot
+from vinetrack.core.terminal import plot, table
 from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.core.units import number
 from vinetrack.diagnosis.replicates import (
     AlignedTrials,
     Replicates,
@@ -120,8 +121,22 @@ class Comparison:
     def __repr__(self) -> str:
         return f"Comparison({len(self.trials)} trials, {len(self.table)} conditions)"
 
+    def __str__(self) -> str:
+        return "\n".join(comparison_lines(self.table))
+
     def _repr_html_(self) -> str:
         return str(self.table._repr_html_())  # type: ignore[operator]
+
+
+def comparison_lines(compared: pd.DataFrame) -> list[str]:
+    """Return model and measurement of every condition as lines of an aligned table, below the effects of the model."""
+    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
+    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
+    shown = (compared[[*scale]] * [*scale.values()]).map(number)
+    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
+    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
+    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
+    return [*compared["model"][:1].str.replace("+", " + "), *lines]
 
 
 @in_one_blas_thread

@@ -82,9 +82,6 @@ class Failure:
                 name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")
             }
             yield remark("fails_most", condition=condition, **numbers)
-            # 2.0: significance, in standard deviations, from which it is said to fail in a condition
-            count = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum())
-            yield remark("fails_in", count=count, total=len(table))
         else:
             yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=condition)
         yield from self.drift.remarks

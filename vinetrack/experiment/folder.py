@@ -159,10 +159,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     """Read the sheet as a table and check its columns."""
-    remedy = (
-        f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
-        "creates both from a folder of recordings"
-    )
+    remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         raise ExperimentError([Problem("no_folder", message, file=str(folder), remedy=remedy)])
@@ -419,17 +416,14 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
     """Warn of confounding: order with pressure, and specimen or day with condition."""
     from pandas import DataFrame
 
-    correlation = order_pressure_correlation(trials)
+    correlation, (_, stated) = order_pressure_correlation(trials), trial_order(trials)
     # 0.7: rank correlation above which order and pressure count as confounded (derived)
     if abs(correlation) >= 0.7:
-        message = (
-            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
-            if trial_order(trials)[1]
-            else f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials "
-            "were run in this order, a drift would look like a physical effect"
-        )
+        said = "" if stated else "is blank: taken as that of the rows, which "
+        message = f"{said}follows the pressure (rank correlation {correlation:.2f}): a drift would look like an effect"
         remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
-        yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
+        severity = "warning" if stated else "note"
+        yield Problem("confounded", message, "order", file=SHEET, severity=severity, remedy=remedy)
     frame = DataFrame(map(vars, trials), columns=["vine", "condition", *GROUPINGS])
     for column in GROUPINGS if trials else ():
         # Every condition has a single specimen or day, while they differ within a vine.
@@ -493,11 +487,12 @@ def _check_track(trial: Trial) -> list[Problem]:
     elif abs((frames := step_s * trial.capture_fps) - 1) > 0.02:
         remarks["capture_fps"] = f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?"
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
-    # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
-    if travel_m > 2 * trial.length_m:
+    # A factor of 2 allows for a poor scale or axis, but not for millimetres or pixels read as metres; 0.001 for the
+    # beginning of a motion, but not for metres read as pixels.
+    if not 0.001 < travel_m / trial.length_m < 2 and math.isfinite(trial.length_m):
         remarks["longer_than_the_vine"] = (
             f"travels {travel_m:.4g} m, but the vine is {1000 * trial.length_m:g} mm long by the sheet: is length_mm "
-            "in millimetres, and are the positions in metres?"
+            "in millimetres, and what are the units of the positions (pixels take mm_per_px)?"
         )
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
         remarks["backwards"] = "runs backwards: position should grow as the vine does"
@@ -510,12 +505,10 @@ def _check_track(trial: Trial) -> list[Problem]:
 
 def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
     """Check that a recording exists and is not empty; `named_videos` are the recordings named by any trial."""
-    code, message, remedy = "empty", "is an empty file", "copy it again"
+    code, message, remedy = "empty", "is empty", "copy it again"
     try:
         if any(path.iterdir()) if path.is_dir() else tables.file_size(path):
             return []
-        if path.is_dir():
-            message, remedy = "is an empty folder", "put the frames in it"
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", tables.missing_file_message(path)
         if not path.is_symlink() and (close := closest_entry(path, named_videos)):

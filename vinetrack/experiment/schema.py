@@ -27,8 +27,6 @@ from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number, safe_join
 from vinetrack.core.units import UNITS, Unit, convert, split_unit
 
-Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
-
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
@@ -92,7 +90,7 @@ class Column:
         """Return a trial's value of this column."""
         return self.scale.from_si(float(getattr(trial, self.field)))
 
-    def read(self, text: str, decimal: str = ".") -> Value:
+    def read(self, text: str, decimal: str = ".") -> Any:
         """Return the value of a non-blank cell, in the unit of its column."""
         try:
             match self.kind:
@@ -191,8 +189,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         return ""
     if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
         return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
-    others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
-    return f"did you mean {nearest[0]}?{others}"
+    return f"did you mean {nearest[0]}?"
 
 
 # ------------------------------------------------------------------------------

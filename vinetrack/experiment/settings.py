@@ -91,6 +91,11 @@ class TwoPoints(_TwoEnds):
     length_mm: Annotated[Positive, "Two marks of a ruler in the plane of growth."]
     """Distance between the two points."""
 
+    @property
+    def mm_per_px(self) -> float:
+        """The scale, the same everywhere."""
+        return self.length_mm / math.dist(self.from_px, self.to_px)
+
 
 class Board(_Strict):
     """A printed target."""
@@ -353,6 +358,10 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
         return Problem("unknown_key", "is not a setting", remedy=remedy, **place)
     if detail["type"] == "missing":
         return Problem("missing", "is missing", remedy="add it", **place)
+    if detail["type"].startswith("union_tag"):  # of a calibration, by its kind
+        kind = detail["ctx"].get("tag", "")
+        place |= {"column": "calibration.kind", "value": kind, "allowed": ", ".join(CALIBRATIONS)}
+        return Problem("not_a_choice", "is unknown", remedy=did_you_mean(kind, CALIBRATIONS) or "add it", **place)
     place["value"] = str(detail["input"]) if isinstance(detail["input"], str | int | float | bool) else None
     error = detail.get("ctx", {}).get("error")
     if isinstance(error, InputError):
@@ -363,7 +372,7 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
 
 
 # ------------------------------------------------------------------------------
-# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning.
+# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a note.
 
 
 def _in_other_units(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -372,7 +381,7 @@ def _in_other_units(names: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Convert columns in other units to those of the sheet, with a warning each; of two units the blank gives way."""
+    """Convert columns in other units to those of the sheet, with a note each; of two units the blank gives way."""
     problems: list[Problem] = []
     known, renamed = _in_other_units(COLUMNS), dict[str, tuple[str, str]]()
     taken = {name for name in table.columns if any(row[name] for row in table.rows)}
@@ -394,7 +403,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 
 def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> None:
-    """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
+    """Convert keys in other units to those of the settings, with a note each; of two units the blank gives way."""
     of_group: dict[str, Any] = {"": [ExperimentSettings], "limits": [Limits], "axis": [AxisSettings]}
     for group, models in (of_group | {"calibration": CALIBRATIONS.values()}).items():
         keys, path = (document.content.get(group), (group,)) if group else (document.content, ())
@@ -425,7 +434,7 @@ def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
 def _conversion(name: str, unit: str, **place: Any) -> Problem:
     own = split_unit(name)[1]
     message = f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
-    return Problem("unit", message, severity="warning", **place)
+    return Problem("unit", message, severity="note", **place)
 
 
 # ------------------------------------------------------------------------------
@@ -487,11 +496,9 @@ def reference_page() -> str:
     page = """\
 # Every column and key
 
-Generated from the declarations that validate them: `vinetrack settings` prints the same,
-`vinetrack settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md`
-writes this page. A column, or a key of `experiment.yaml`, may state another unit in its name
-(`pressure_psi`, `diameter_in`, …): it is converted, as `vinetrack check` says; pages show pressures in it.
-A blank cell means the default.
+Printed by `vinetrack settings`, also with `--json -`; `--page docs/settings.md` writes this page. A column, or a key of
+`experiment.yaml`, may state another unit in its name (`pressure_psi`, `diameter_in`, …): it is converted, as `vinetrack
+check` says; pages show pressures in it. A blank cell means the default.
 """
     for _, title, entries in _groups():
         heading, _, shared = title.partition("; ")

@@ -212,6 +212,8 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         "yield_pressure_kPa": 0.0,
         "yield_pressure_sigma_kPa": YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0,
     }
+    scale = getattr(settings.calibration, "mm_per_px", None)  # of a recording its picture is asked, as for its lens
+    defaults |= {"mm_per_px": scale} if scale and "track" in row.values else {}
     values: dict[str, Any] = {**defaults, **row.values, "trial": row.name}
     return Trial(
         **{COLUMNS[name].field: COLUMNS[name].in_trial(value, folder) for name, value in values.items()},

@@ -59,11 +59,8 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
             ax.plot(errors_mm, marker=marker, color=colour, ls=line, ms=7, zorder=3, label=label)
     if expected := expected_text(*ladder[EXPECTED].iloc[-1]):
         middle, low, high = 1e3 * ladder[EXPECTED].iloc[-1]
-        ax.axhspan(low, high, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.axhspan(low, high, color=st.MUTED, alpha=0.16, lw=0, zorder=0, label=f"an adequate model: {expected}")
         ax.axhline(middle, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
-        frame = (("axes fraction", "data"), "offset points")
-        words = f"an adequate model: {expected}"
-        ax.annotate(words, (0.015, low), (0, 4), *frame, color=st.MUTED, va="bottom", fontsize=9)
     ax.margins(y=0.15)
     st.plain_log_ticks(ax, "y")
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
@@ -92,7 +89,7 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
     trials = before_after.groupby("trial", sort=False)
     for _, part in trials:
-        shown = st.thinned(part[part["time_s"] >= -0.06 * part["time_s"].iloc[-1]], 160)
+        shown = st.thinned(part[part["time_s"] >= -0.06 * part["time_s"].iloc[-1]], 60)
         time_ms, measured_mm = st.column(shown, "time_s", 1e3), st.column(shown, "lead_position_m", 1e3)
         growth.plot(time_ms, measured_mm, ".", color=st.MUTED, ms=4.5, mew=0)
         for model, (colour, line, _) in models.items():

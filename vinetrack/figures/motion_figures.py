@@ -39,10 +39,13 @@ def draw_trial_motion(
     counts = f"{len(kinematics)} points"
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
-    strip_from, strip_in = 0.86, 0.24 * max(len(windows), 1)
-    speed_from = strip_from + strip_in + 0.12
-    lead_from = speed_from + 2.1 + 0.12
-    fig, sheet = st.new_sheet(7.2, lead_from + 1.75 + 0.38)
+    kinematics = st.thinned(kinematics, 60)
+    # From below, in: counts and time scale, a bar for each window, speed, position, title; to the right a second scale
+    strip_from, strip_in, speed_in, lead_in, title_in = 0.86, 0.24 * max(len(windows), 1), 2.1, 1.75, 0.38
+    left, wide_in, right_in, gap_in = 0.9, 5.5, 0.8, 0.12
+    speed_from = strip_from + strip_in + gap_in
+    lead_from = speed_from + speed_in + gap_in
+    fig, sheet = st.new_sheet(left + wide_in + right_in, lead_from + lead_in + title_in)
     time_s, position_mm = st.column(track, "time_s"), st.column(track, "lead_position_m", 1e3)
     known = np.isfinite(position_mm)
     speed_m_s, two_sigma_m_s = (
@@ -50,11 +53,11 @@ def draw_trial_motion(
         for name, factor in (("lead_velocity_m_s", 1.0), ("lead_velocity_sigma_m_s", 2.0))
     )
     over = _with_margin(time_s[known])
-    lead = st.Panel(sheet, (0.9, lead_from, 5.5, 1.75), over, _with_margin(position_mm[known]))
-    speed = st.Panel(sheet, (0.9, speed_from, 5.5, 2.1), over, _speed_limits(speed_m_s, two_sigma_m_s))
-    strip = st.Panel(sheet, (0.9, strip_from, 5.5, strip_in), over, (len(windows) - 0.4, -0.6))
+    lead = st.Panel(sheet, (left, lead_from, wide_in, lead_in), over, _with_margin(position_mm[known]))
+    speed = st.Panel(sheet, (left, speed_from, wide_in, speed_in), over, _speed_limits(speed_m_s, two_sigma_m_s))
+    strip = st.Panel(sheet, (left, strip_from, wide_in, strip_in), over, (len(windows) - 0.4, -0.6))
 
-    step = max(len(track) // 300, 1)
+    step = max(len(track) // 40, 1)  # chosen: few points, since the curve goes through them, keep the figure small
     lead.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
     lead.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
     lead.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)
@@ -82,7 +85,7 @@ def draw_trial_motion(
     for panel in (lead, speed):
         panel.scale("bottom", numbered=False)
     strip.scale("bottom", "time (s)")
-    lead.write(over[0], lead.y[1], title, (0, 8), fontweight="bold", fontsize=st.fitting_size(title, 415, 11))
+    lead.write(over[0], lead.y[1], title, (0, 8), fontweight="bold", fontsize=st.fitting_size(title, 72 * wide_in, 11))
     sheet.text(0.09, 0.22, counts, color=st.MUTED, fontsize=8.8, va="top")
     return fig
 
@@ -158,7 +161,7 @@ def _model_panels(
     comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], corner: tuple[float, float, str, str],
     x_label: str, y_label: str,
 ) -> tuple[Figure | None, list[tuple[Axes, list[pd.DataFrame], pd.DataFrame, str]]]:  # fmt: skip
-    """A page of small panels, about 1.3 times as high as wide, with the numbers of each in a corner. Returns it, and
+    """A page of small panels, with the numbers of each in a corner. Returns it, and
     for every panel its axes, its trials from shortly before anything moves, the longest of them, and its colour.
     """
     known = comparison[comparison["condition"].isin(list(trajectories))]
@@ -167,14 +170,16 @@ def _model_panels(
     if not shown:
         return None, []
     n, n_trials = len(shown), sum(trajectories[row.condition]["trial"].nunique() for row in shown)
-    n_points = min(max(12_000 // n_trials, 25), 150)  # 12,000 in all keep the SVG below a megabyte
+    n_points = min(max(1_000 // n_trials, 25), 150)  # 1,000 in all keep the SVG below 50 kB (measured)
     title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
     if len(known) > n:
         title += f"; the {n} of {len(known)} conditions with the largest error"
+    # Chosen by eye: a page 11 in wide, panels of at most 6 in and 1.3 times as wide as high, letters that fit them,
+    # and below and above them 0.95 in for labels and title, of which an inch holds 11 letters
     n_columns = min(math.ceil(math.sqrt(1.3 * n)), 8) if n > 3 else n
     font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
     panel_in = min(11.0 / n_columns, 6.0)
-    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
+    row_in = min(max(panel_in / 1.3, 1.35), 3.6)
     fig = st.new_figure(n_columns * panel_in, math.ceil(n / n_columns) * row_in + 0.95)
     styles, (x, y, ha, va), panels = st.vine_styles([row.vine for row in shown]), corner, []
     for ax, row in zip(st.panel_grid(fig, n, n_columns), shown, strict=True):

@@ -190,12 +190,12 @@ def draw_power(power: Power) -> Figure | None:
     if not entries or power.wary:
         return None
     n = len(entries)
-    least, most, n_columns = 1e-4, 3.0, 108  # sizes relative to the largest plausible one
+    least, most, n_columns = 1e-4, 3.0, 108  # sizes relative to the largest plausible one, 24 to a decade (chosen)
     parts = np.geomspace(least, most, n_columns)
     probabilities = np.array([
         [one.probability_at(one.zero + part * (one.largest - one.zero)) for part in parts] for one in entries
     ])  # fmt: skip
-    fig = st.new_figure(9.6, 0.31 * n + 1.75)
+    fig = st.new_figure(9.6, 0.31 * n + 1.75)  # in: a line of letters for each row, and title, scale and legend
     ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
     shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", st.BLUE, "#003f66"])
     mesh = ax.pcolormesh(parts, np.arange(n), probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)

@@ -144,13 +144,12 @@ class FigureTables:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """Measured and modelled growth of all trials, at most 6000 rows (chosen) at an even stride."""
+        """Measured and modelled growth of all trials, at most 1000 rows (chosen) at an even stride."""
         import pandas as pd
 
-        conditions = read_result(self.results.comparison)["condition"]
-        parts = [read_result(self.results.trajectories(name)).assign(condition=name) for name in conditions]
+        parts = [table.assign(condition=name) for name, table in self.trajectories.items()]
         whole = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-        return whole.iloc[:: -(-len(whole) // 6000) or 1]
+        return whole.iloc[:: -(-len(whole) // 1000) or 1]
 
     @cached_property
     def diagnosed(self) -> DiagnosisTables | None:

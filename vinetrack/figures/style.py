@@ -149,10 +149,9 @@ def write_figure(fig: Figure, path: Path) -> None:
 
 def check_figure(path: Path | None) -> None:
     """Check the suffix of an output figure before anything is computed."""
-    figure_formats = (".png", ".svg", ".pdf")
-    if path is not None and path.suffix.lower() not in figure_formats:
-        remedy = f"end it in one of {', '.join(figure_formats)}"
-        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
+    if path is not None and path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        problem = Problem(message="is not the name of a picture", file=str(path), remedy="end it in .png, .svg or .pdf")
+        raise ExperimentError([problem])
 
 
 # ------------------------------------------------------------------------------
@@ -206,18 +205,17 @@ class Panel:
         off_in: float = 0.0,
     ) -> None:  # fmt: skip
         """Draw the scale of the left, right or bottom, in its values times a factor, at a distance from the panel."""
-        from matplotlib.collections import LineCollection
         from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
         left, bottom, right, _ = self.box.extents
         below = side == "bottom"
-        upright: dict[str, Any] = {"va": "center", "rotation": 90}
         # From where the scale goes in which direction, what is outside, and how far outside its label is
-        start_in, along, out, label_in, place = {
-            "left": ((left, bottom), (0, 1), (-1, 0), 0.52, {"ha": "right", **upright}),
-            "right": ((right, bottom), (0, 1), (1, 0), 0.39, {"ha": "left", **upright}),
+        sides: dict[str, Any] = {
+            "left": ((left, bottom), (0, 1), (-1, 0), 0.52, {"ha": "right", "va": "center", "rotation": 90}),
+            "right": ((right, bottom), (0, 1), (1, 0), 0.39, {"ha": "left", "va": "center", "rotation": 90}),
             "bottom": ((left, bottom - off_in), (1, 0), (0, -1), 0.28, {"ha": "center", "va": "top"}),
-        }[side]
+        }
+        start_in, along, out, label_in, place = sides[side]
         length_in, depth_in = (abs(np.dot(way, self.box.size)) for way in (along, out))
         start, end = factor * np.array(self.x if below else self.y)
         low, high = sorted((start, end))
@@ -233,8 +231,10 @@ class Panel:
         zero = at(values, 0.0)
         lines = list(zip(zero, at(values, -depth_in), strict=True)) if grid else []
         marks = [*zip(zero, at(values, 0.05), strict=True), (at(start, 0.0)[0], at(end, 0.0)[0])]
-        style: dict[str, Any] = {"colors": [GRID] * len(lines) + [INK] * len(marks), "linewidths": 0.8, "zorder": 0.5}
-        self.sheet.add_collection(LineCollection([*lines, *marks], **style), autolim=False)
+        for colour, pieces in ((GRID, lines), (INK, marks)):  # each a single line with gaps, which is small in an SVG
+            if pieces:
+                ends = np.concatenate([[*piece, (math.nan, math.nan)] for piece in pieces])
+                self.sheet.plot(*ends.T, color=colour, lw=0.8, zorder=0.5)
         if not numbered:
             return
         formatter = ScalarFormatter()

@@ -336,7 +336,7 @@ def pairs_of(
             pairs.append((trial, tracks[trial.name]))
             continue
         if trial.track is None:
-            left_out[trial.name] = "its recording has not been tracked: run snakemake, or give its track"
+            left_out[trial.name] = "its recording has not been tracked: run `vinetrack run`, or give its track"
             continue
         try:
             pairs.append((trial, correct_frames(load_track(trial))))

@@ -41,7 +41,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results import folder_layout
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
-from vinetrack.tracks.importers import flag_end_of_motion, points_track
+from vinetrack.tracks.importers import flag_end_of_motion, table_track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -257,7 +257,7 @@ def _cells(name: str, part: pd.DataFrame, position: str) -> dict[str, str]:
 
 def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
     if position in ("x", "y"):
-        return flag_end_of_motion(trial, points_track(part.to_csv(index=False), trial))
+        return flag_end_of_motion(trial, table_track(part.to_csv(index=False), trial))
     known = {name: part[name].to_numpy(dtype=float) for name in ERROR_COLUMNS if name in part}
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1

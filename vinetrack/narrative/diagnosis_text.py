@@ -237,13 +237,17 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     return "\n".join(lines)
 
 
-def table_lines(diagnosis: Diagnosis, notes: bool = True) -> list[str]:
-    """Return the rows of the verdict table below its headline, as aligned lines of at most 120 characters."""
+def table_lines(diagnosis: Diagnosis, in_short: bool = False) -> list[str]:
+    """Return the rows of the verdict table below its headline, as aligned lines of at most 120 characters; in short
+    without the notes beside them, and a line each, or two for the law and for what to do.
+    """
     first, *rows = verdict_table(diagnosis)
     width = max((len(row.question) for row in rows), default=0)
     lines = [f"  {first.note}"] if first.note else []
     for row in rows:
-        told = [line for text in (row.answer, row.note if notes else "") for line in textwrap.wrap(text, 116 - width)]
+        most = (2 if row.question.startswith(("F =", "What to do")) else 1) if in_short else None
+        texts = (row.answer,) if in_short else (row.answer, row.note)
+        told = [line for text in texts for line in textwrap.wrap(text, 116 - width, max_lines=most, placeholder=" …")]
         lines += [f"  {'' if k else row.question:<{width}}  {line}" for k, line in enumerate(told)]
     return lines
 

@@ -173,13 +173,11 @@ def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
     answer = ""
     if diagnosis.verdict == ADEQUATE and tested:
         best = max(tested, key=lambda row: abs(row.sigma))
-        answer = (
-            f"{spaced_name(best.effect)}, the most significant of {len(tested)} candidates, reaches {_sigmas(best)} σ"
-        )
+        answer = f"{spaced_name(best.effect)}, the most significant candidate, reaches {_sigmas(best)} σ"
     elif inside:
         answer = f"{_sigmas(max(inside, key=attrgetter('delta_chi2')))} σ"
         if len(inside) > 1:
-            answer += f"; {len(inside)} of {len(tested)} candidates fit equally well"
+            answer += f"; {len(inside)} candidates fit equally well"
     notes = [_errors(diagnosis.ladder)]
     if diagnosis.power is not None:
         notes.append(f"false alarms in at most {percent(diagnosis.power.false_alarm_rate)} of such campaigns")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -193,7 +194,7 @@ class ProposalPanel:
         self._job: Job[str, tuple[list[str], list[Path]]] | None = None
         self._task, self._begun_s = "", 0.0
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
-        command = f"vinetrack propose {page.campaign.folder.as_posix()}"
+        command = shlex.join(["vinetrack", "propose", page.campaign.folder.as_posix()])
         self.text = Div(text=panel("propose", line=command), name="proposal")
         diagnosis, unexplained = page.diagnosis, False
         if diagnosis is not None and not diagnosis.contradicted_columns:

@@ -32,6 +32,7 @@ from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import SHEET
+from vinetrack.tracks.importers import read_track
 from vinetrack.video.survey import MIN_PICTURES, entries, is_calibration, list_recordings, natural_order
 
 # ------------------------------------------------------------------------------
@@ -94,15 +95,17 @@ def cells_of(sheet: Table) -> list[list[str]]:
 
 
 def with_recordings(sheet: Table, recordings: Sequence[str], shared: Mapping[str, object]) -> Table:
-    """Return the sheet with a row added for each recording that has none, filled in from the recordings' names."""
-    named = {_path(row.get("video", "")) for row in sheet.rows}
+    """Return the sheet with a row added for each recording, or track, that has none, filled in from their names."""
+    named = {_path(row.get(column, "")) for row in sheet.rows for column in ("video", "track")}
     new = [recording for recording in recordings if _path(recording) not in named]
     if not new:
         return sheet
     names = trial_names(new, [row.get("trial", "") for row in sheet.rows])
-    columns, rows = list(sheet.columns), list(sheet.rows)
+    source = "track" if PurePosixPath(new[0]).suffix.lower() in TABLES else "video"
+    columns = [source if name == "video" and not sheet.rows else name for name in sheet.columns]
+    rows = list(sheet.rows)
     for recording, name, guess in zip(new, names, columns_from_names(new), strict=True):
-        row = {"trial": name, "video": recording}
+        row = {"trial": name, source: recording}
         for column, cell in guess.items():
             present = column_of(column, columns)
             # Cells of an existing sheet keep their units.
@@ -114,7 +117,7 @@ def with_recordings(sheet: Table, recordings: Sequence[str], shared: Mapping[str
                 columns.append(column)
             row[column] = cell.replace(".", sheet.decimal or ".")
         rows.append(row)
-    missing = [column for column in ("trial", "video") if column not in columns]
+    missing = [column for column in ("trial", source) if column not in columns]
     return replace(sheet, columns=(*missing, *columns), rows=tuple(rows))
 
 
@@ -222,10 +225,12 @@ def open_draft(folder: Path) -> Draft:
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         raise _refusal(message, str(folder), "name the folder that holds the recordings")
     settings = read_settings_text(folder)
-    recordings = list_recordings(folder)
+    recordings = list_recordings(folder) or list_tracks(folder)
     sheet = read_sheet(folder)
     if not recordings and not sheet.rows:
-        remedy = "put films (mp4, mov, avi, mkv) or folders of pictures in it"
+        remedy = (
+            "put films (mp4, mov, avi, mkv), folders of pictures, or tables of positions (time_s, position_m) in it"
+        )
         raise _refusal("holds no recording", str(folder), remedy)
     corrections, problems = read_corrections(folder)
     if problems:
@@ -345,7 +350,7 @@ def place_block(
             notes.append(f"No recording for “{' '.join(cells)}”: left out.")
             continue
         for name, cell in zip(header, cells, strict=False):
-            if name and name != "trial":
+            if cell and name and name != "trial":
                 column = column_of(name, columns)
                 placed.append((row, column, in_unit_of(column, name, cell, decimal)))
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
@@ -419,18 +424,26 @@ def list_pictures(folder: Path) -> list[str]:
     return sorted((path.relative_to(folder).as_posix() for path in pictures), key=natural_order)
 
 
-def list_tables(folder: Path) -> list[str]:
-    """Return tables that may be pressure traces, as paths relative to the folder."""
+TABLES = (".csv", ".txt", ".tsv", ".trk")  # Endings of files that may be tracks
+NOTES = (".txt", ".md", ".tsv", ".csv")  # and of notes on the recordings
+
+
+def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
+    """Return files with these endings, such as pressure traces, as paths relative to the folder."""
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
-    tables = [path for place in folders for path in entries(place) if path.suffix.lower() == ".csv"]
+    tables = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
     names = (path.relative_to(folder).as_posix() for path in tables)
     return sorted((name for name in names if name not in FILES), key=natural_order)
 
 
-def list_notes(folder: Path) -> list[str]:
-    """Return the files that may be notes on the recordings, by name."""
-    names = [path.name for path in entries(folder) if path.suffix.lower() in (".txt", ".md", ".tsv", ".csv")]
-    return sorted((name for name in names if name not in FILES), key=natural_order)
+def list_tracks(folder: Path) -> list[str]:
+    """Return files of positions measured elsewhere, whatever rate and scale they leave open."""
+    found = []
+    for name in list_tables(folder, TABLES):
+        with suppress(InputError):
+            read_track(folder / name, capture_fps=1.0, m_per_px=1e-3)
+            found.append(name)
+    return found
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
@@ -479,7 +492,8 @@ def _cells_of_name(recording: str) -> dict[str, tuple[str, str]]:
                 name = "length" if name == "diameter" and not letters and name in of_part else name
                 own = column_of(name, COLUMNS)
                 column = next((other for other in (own, *other_units(own)) if other.lower() == f"{name}_{unit}"), "")
-                if name and (column or not unit):
+                # After a letter, one digit counts trials or takes: `t1` is no thickness.
+                if name and (column or not unit) and (unit or len(letters) != 1 or len(number) > 1):
                     cell = number.replace("p", ".")
                     of_part[name] = column or own, f"{float(cell):g}" if COLUMNS[own].kind == "number" else cell
         cells |= of_part
@@ -488,7 +502,7 @@ def _cells_of_name(recording: str) -> dict[str, tuple[str, str]]:
 
 def _stem(recording: str) -> str:
     path = PurePosixPath(recording)
-    return path.stem if path.suffix.lower() in CONTAINERS | IMAGES else path.name
+    return path.stem if path.suffix.lower() in {*CONTAINERS, *IMAGES, *TABLES} else path.name
 
 
 def _clean(name: str) -> str:

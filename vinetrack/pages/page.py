@@ -19,6 +19,7 @@ from tornado.ioloop import IOLoop
 
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
+from vinetrack.core.units import number
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
@@ -52,6 +53,7 @@ from vinetrack.pages.plots import (
     theme,
     vine_colours,
 )
+from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
@@ -75,12 +77,12 @@ def headline(
         refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
-        command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
+        command=command_for_results(campaign.experiment.folder, campaign.folder),
     )
 
 
 def _in_mm(value_m: float) -> str:
-    return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
+    return f"{number(1e3 * value_m)} mm" if math.isfinite(value_m) else ""
 
 
 def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Number]) -> dict[str, str]:
@@ -126,13 +128,8 @@ def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
 def fit_progress(task: str, step: Step | None, since_s: float) -> str:
     """Return a progress bar of a fit whose number of steps is unknown, as HTML."""
     done = 0 if step is None else step.iteration
-    if step is not None:
-        task += f" · step {done}"
-        if math.isfinite(step.predicted_decrease):
-            gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
-            task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
     # 5: steps after which the bar is half full (chosen)
-    return progress_bar(done / (done + 5), f"{task} · {since_s:.1f} s")
+    return progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
 
 
 # ------------------------------------------------------------------------------
@@ -183,11 +180,7 @@ class Page:
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
         buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
-        hint = Div(
-            text="<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps "
-            "this model for comparison.</small>"
-        )
-        actions = Column(buttons, hint, name="actions")
+        actions = Column(buttons, name="actions")
         texts = [self.headline, self.status, self.numbers, self.tied, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
         panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
@@ -375,7 +368,7 @@ class Page:
             rows = verdict_table(diagnosis)
             advice = next_experiment(diagnosis.next_experiment)
             pairs = tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else pairs
-        command = f"vinetrack diagnose {self.campaign.folder.as_posix()}"
+        command = shlex.join(["vinetrack", "diagnose", self.campaign.folder.as_posix()])
         set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, rows=rows, pairs=pairs))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
 
@@ -405,7 +398,7 @@ class Page:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return
-        rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
+        rerun = command_for_results(folder, self.campaign.folder)
         self.saved.text = panel("saved", path=path.as_posix(), model=model_text(effects), rerun=rerun)
 
     def close(self) -> None:

@@ -352,7 +352,7 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
     except ResultsError as error:
         return str(error)
     if not axis:
-        return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
+        return f"The position of the axis of {trial.name} in its picture was not stored: run `vinetrack run` again."
     line = axis_from_entry(axis)
     width = axis.get("width_px")
     half_px = 0.75 * float(width) if width else 0.05 * line.length_px

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import to_json
 from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
@@ -31,12 +32,12 @@ from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read
 from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.style import render
 from vinetrack.pages.draft_files import (
+    NOTES,
     Draft,
     cells_of,
     column_of,
     draft_folder,
     files_stamp,
-    list_notes,
     list_pictures,
     list_tables,
     open_draft,
@@ -109,7 +110,7 @@ def axis_json(axis: Axis) -> dict[str, Any]:
         # 4.0: spacing of the points of a curve sent to the page, px (chosen)
         along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / 4.0)))
         entry["path_px"] = axis.points(along).round(2).tolist()
-    return {**entry, "width_px": _rounded(axis.width_px, 2)}
+    return {**entry, "width_px": round(axis.width_px, 2)}
 
 
 def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
@@ -153,13 +154,13 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
         "frames": [int(tracking.strip_rows[0]), int(tracking.strip_rows[-1])],
         "length_px": round(tracking.axis.length_px, 2),
         "axis": axis_json(tracking.axis),
-        "time_s": _numbers(track.time_s, 6),
-        "edge_px": _numbers(track.edge_px, 2),
-        "position_mm": _numbers(1e3 * track.lead_position_m, 3),
+        "time_s": np.round(track.time_s, 6).tolist(),
+        "edge_px": np.round(track.edge_px, 2).tolist(),
+        "position_mm": np.round(1e3 * track.lead_position_m, 3).tolist(),
         "flag": [str(flag) for flag in track.flag],
-        "shake_px": _numbers(tracking.shake_px, 2),
-        "growth_mm": _rounded(facts.growth_mm, 2),
-        "tube_width_mm": _rounded(mm_per_px * tracking.tube_width_px, 2),
+        "shake_px": np.round(tracking.shake_px, 2).tolist(),
+        "growth_mm": round(facts.growth_mm, 2),
+        "tube_width_mm": round(mm_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
         "notes": [*notes, *track.notes],
@@ -173,15 +174,6 @@ def _strip_url(fig: Figure) -> str:
         svg = svg.replace(colour, f"var({token})")
     svg = svg.replace("<defs>", f"<style>{TOKENS_CSS.read_text(encoding='utf-8')}</style><defs>", 1)
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-
-
-def _numbers(values: NDArray[Any], digits: int) -> list[float | None]:
-    return [_rounded(float(value), digits) for value in values]
-
-
-def _rounded(value: float, digits: int) -> float | None:
-    """A number for JSON, None for NaN."""
-    return round(value, digits) if math.isfinite(value) else None
 
 
 # ------------------------------------------------------------------------------
@@ -209,18 +201,18 @@ def page_state(folder: Path) -> dict[str, Any]:
         "units": {key: unit.text for key, unit in UNITS.items()},
         "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
-        "kept": list(present.columns) if present.rows else ["trial", "video"],
+        "kept": list(present.columns) if present.rows else ["trial", "video", "track"],
         "unsaved": not (folder / SETTINGS).exists() or not present.rows or cells_of(present) != cells_of(sheet),
         "shared": {key: str(value) for key, value in shared_values(draft.settings).items()},
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
         "corrections": {
-            trial: [vars(point) | {"edge_px": _rounded(point.edge_px, 2)} for point in given]
+            trial: [vars(point) | {"edge_px": round(point.edge_px, 2)} for point in given]
             for trial, given in draft.corrections.items()
         },
         "pictures": list_pictures(folder),
         "traces": list_tables(folder),
-        "notes": list_notes(folder),
+        "notes": list_tables(folder, NOTES),
     }
 
 
@@ -252,8 +244,8 @@ def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[s
         checked = check_folder(copy) if thorough else None
         problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
     return {
-        # The unit of a column was chosen on the page.
-        "problems": [_problem_json(problem, draft.sheet.columns) for problem in problems if problem.code != "unit"],
+        # What is noted, such as a unit, was chosen on the page.
+        "problems": [_problem_json(one, draft.sheet.columns) for one in problems if one.severity != "note"],
         "notes": list(checked.notes) if checked else [],
         "understood": list(checked.recording_lines) if checked else [],
         "texts": draft.texts() | ({} if draft.corrections else {CORRECTIONS_FILE: ""}),
@@ -404,7 +396,7 @@ class _Answer(_Quiet):
             content = {"words": f"{type(error).__name__}: {error}"}
         kinds: dict[type, str] = {bytes: "image/jpeg", str: "text/css; charset=utf-8"}
         self.set_header("Content-Type", kinds.get(type(content), "application/json"))
-        self.finish(content if isinstance(content, bytes | str) else json.dumps(content, ensure_ascii=False))
+        self.finish(content if isinstance(content, bytes | str) else to_json(content, inf_nan_mode="null"))
 
 
 def start_server(desk: Desk, port: int | None = None) -> PageServer:
@@ -432,19 +424,19 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
 
 def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept."""
-    draft = open_draft(folder)
+    present, draft = read_sheet(folder), open_draft(folder)
     written = write_draft(folder, draft)
-    rows = draft.sheet.rows
-    filled = [name for name in draft.sheet.columns if name not in ("trial", "video") and any(r.get(name) for r in rows)]
-    for name in written:
-        say(f"Written: {folder / name}")
-    if not written:
-        say(f"{SHEET} and {SETTINGS} of {folder} already contain every recording.")
-    say(f"{len(rows)} trials; from the names of recordings: {', '.join(filled) if filled else 'nothing'}.")
+    columns, added = draft.sheet.columns, draft.sheet.rows[len(present.rows) :]
+    filled = [name for name in columns if name not in ("trial", "video", "track") and any(r.get(name) for r in added)]
+    there = f"{SHEET} and {SETTINGS} of {folder} already contain every recording."
+    for line in [f"Written: {folder / name}" for name in written] or [there]:
+        say(line)
+    named = f", {len(added)} of them new; from their names: {', '.join(filled) or 'nothing'}" if added else ""
+    say(f"{len(draft.sheet.rows)} trials{named}.")
     problems = [*check_experiment(folder), *_scale_missing(draft)]
     errors = [problem for problem in problems if problem.severity == "error" and problem.column]
     missing = {problem.column for problem in errors if problem.code in ("missing", "blank")}
-    blanks = [*(name for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
+    blanks = [*(column_of(name, columns) for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
     say(f"Then: vinetrack check {folder}")

@@ -49,7 +49,15 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    measured_trials,
+    read_diagnosis,
+    read_json,
+    read_result,
+    table_of,
+)
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
@@ -188,8 +196,9 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
+    ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
+    tables = diagnosis_tables(diagnosis) | {"steps.csv": _all_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
-    tables = diagnosis_tables(diagnosis)
     tables |= {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
@@ -199,9 +208,23 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_csv(folder / name, table)
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
-    write_csv(results.ladder, table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
+    write_csv(results.ladder, ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
+
+
+def _all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+    """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
+    if its error there is the same, so that it is of the same trials.
+    """
+    import pandas as pd
+
+    former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
+    for k, row in enumerate(former.to_dict("records") if len(ladder) else ()):
+        now = ladder.iloc[0]
+        if row["model"] == now["model"] and np.isclose(row["rms_in_sample_m"], now["rms_in_sample_m"], 1e-3, 0.0):
+            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
+    return ladder
 
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
@@ -258,10 +281,10 @@ def propose_effect(
     diagnosis = read_diagnosis(results)
     if diagnosis is None:
         raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
-    if diagnosis.contradicted_columns:
+    if diagnosis.contradicted_columns or not diagnosis.verdict:
         raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
-        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.final_verdict)))
+        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
     pairs, _ = measured_trials(experiment, results)
     proposal = propose(model, pairs, report)

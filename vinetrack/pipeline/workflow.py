@@ -246,7 +246,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.inference.fit_data import not_measured
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
-    from vinetrack.tracks.importers import load_track
+    from vinetrack.tracks.importers import load_track, track_lines
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
     from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
@@ -283,7 +283,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         notes.append(str(remark("smoothed", how=str(smoothing), frames=smoothing.decimation)))
     if rounding_m > 0:
         notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
-    return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))
+    return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), (*lines, *track_lines(tracks)), tuple(notes))
 
 
 def model_problems(experiment: Experiment) -> list[Problem]:

@@ -590,16 +590,13 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     as_stated = _middle_ratio(pairs)
     if not (as_stated < 1 / far_off or as_stated > far_off):
         return []
-    psi = convert(1.0, "psi", "kPa")
-    factor, wrong, right = (psi, "psi, not kPa", "psi") if as_stated < 1 else (1 / psi, "kPa, not psi", "kPa")
-    other_unit = f"{wrong} (1 psi is {psi:.4g} kPa)", "in the other unit", f"name the column pressure_{right}"
-    absolute = (
-        "absolute pressure",
-        "after the ambient pressure is subtracted",
-        "state gauge pressure, relative to the ambient pressure",
-    )
+    psi, stated = convert(1.0, "psi", "kPa"), pairs[0][0].pressure_unit
+    factor, right, wrong = (psi, "psi", "kPa") if as_stated < 1 else (1 / psi, "kPa", "psi")
+    how_much = f"(1 psi is {psi:.4g} kPa)"
+    other_unit = f"{right}, not {wrong} {how_much}", "in the other unit", f"name the column pressure_{right}"
+    absolute = "absolute pressure", "after the ambient pressure is subtracted", "state gauge pressure"
     gauge = [(replace(t, pressure_Pa=t.pressure_Pa - t.ambient_pressure_Pa), speed) for t, speed in pairs]
-    converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs]
+    converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs if stated == wrong]
     with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
     gauge = gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else []
     for meant, (what, how, remedy) in ((gauge, absolute), (converted, other_unit), (with_yield, other_unit)):

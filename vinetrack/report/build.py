@@ -25,11 +25,9 @@ from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, RULE_NAMES, VERMILLION, rows
-from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import (
     LAW_METHODS,
     POWER_COLUMNS,
-    PREFERRED,
     damping_headline,
     false_alarm_sentence,
     power_rows,
@@ -41,7 +39,6 @@ from vinetrack.narrative.verdict_text import (
     expected_text,
     is_finite,
     listed_names,
-    quantity_text,
     settled_rows,
     spaced_name,
     verdict_sentence,
@@ -82,8 +79,8 @@ def inline_picture(picture: str | bytes | None, prefix: str, description: str) -
 
 
 def _inline_svg(svg: str, prefix: str, description: str) -> str:
-    """An SVG of matplotlib with its colours from the page, so that it follows a dark scheme, its identifiers unique,
-    coordinates to a hundredth of a point, and its images as WebP.
+    """An SVG of matplotlib with its colours and fonts from the page, so that it follows a dark scheme, the identifiers
+    that it uses unique, coordinates to a tenth of a point, and its images as WebP.
     """
     found = re.search(r'<svg[^>]* viewBox="0 0 ([\d.]+) ([\d.]+)"[^>]*>(.*)</svg>', svg, re.DOTALL)
     if found is None:
@@ -93,15 +90,18 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     any_colour = re.compile("|".join(colours))
 
     def short(tag: re.Match[str]) -> str:
-        return any_colour.sub(lambda match: colours[match[0]], re.sub(r"(\.\d\d)\d+", r"\1", tag[0]))
+        return any_colour.sub(lambda match: colours[match[0]], re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0]))
 
     body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", found[3], flags=re.DOTALL)
     body = re.sub(r"<(?!image)[^>]*>", short, body)  # images are placed by matrices, which need all their decimals
-    own = f"{escape(prefix, quote=True)}-"
-    body = re.sub(r'\bid="|url\(#|href="#', lambda match: match[0] + own, body)
+    used = dict.fromkeys(re.findall(r'(?:url\(|href=")#([^")]+)', body))
+    own = {name: f"{escape(prefix, quote=True)}-{k}" for k, name in enumerate(used)}
+    body = re.sub(r' id="([^"]*)"', lambda match: f' id="{own[match[1]]}"' if match[1] in own else "", body)
+    body = re.sub(r'(url\(|href=")#([^")]+)', lambda match: f"{match[1]}#{own[match[2]]}", body)
+    body = re.sub(r'font-family: [^;"]*;? ?| transform="rotate\(-0 [^"]*"', "", body)
     # WebP quality of the images in a strip, 0 to 100
     body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
-    body = re.sub(r"\s*\n\s*", " ", body)
+    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body))
     label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
     return f"<svg {head}>{body}</svg>"
@@ -193,8 +193,6 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
-        "moved": moved_table(content["moved"]),
-        "laws": law_rows(content["laws"]),
         "notes": list(diagnosis.notes),
     }
 
@@ -307,37 +305,6 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "learned": str(learned.get("sentence") or ""),
         "weights": weights,
     }
-
-
-def moved_table(moved: pd.DataFrame | None) -> ReportTable:
-    """Return the change of the parameters as effects were added, one column per model."""
-    entries = [] if moved is None else moved.fillna({"vine": "", "added": ""}).to_dict("records")
-    cells: dict[tuple[str, str], dict[str, str]] = {}
-    titles: dict[tuple[str, str], str] = {}
-    for entry in entries:
-        key = (str(entry["parameter"]), str(entry["vine"]))
-        fitted = Number.from_json({str(k): v for k, v in entry.items()})
-        titles[key] = fitted.title
-        cells.setdefault(key, {})[str(entry["added"])] = quantity_text(fitted)
-    steps = list(dict.fromkeys(str(entry["added"]) for entry in entries))
-    head = ["Parameter", *map(_step, steps)]
-    rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
-    return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
-
-
-def law_rows(laws: pd.DataFrame | None) -> list[tuple[str, ...]]:
-    """Return the damping law from steady speeds with the pressure at the vine in each model."""
-    if laws is None or not len(laws):
-        return []
-    chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws
-    first = set(str(chosen["model"].iloc[0]).split("+"))
-    rows: list[tuple[str, ...]] = []
-    for entry in chosen.to_dict("records"):
-        added = [name for name in str(entry["model"]).split("+") if name not in first]
-        bounds = {key: [entry[f"{key}_low_95"], entry[f"{key}_high_95"]] for key in ("n", "B")}
-        row = (_step("+".join(added)), str(entry["vine"]), number(entry["n"], 4), interval(bounds["n"]))
-        rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
-    return rows
 
 
 # ------------------------------------------------------------------------------
@@ -480,15 +447,11 @@ MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single tria
 def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int]:
     """Return all trials for the template, and how many of them have their figures left out for size."""
     entries, left_out, weight, windows = [], 0, 0, content["windows"]
-    # 240, 24_000: maximum rows of motion data in the page, per trial and in total
-    most = max(min(24_000 // len(content["trials"]), 240), 2)
-    for row in rows(content["trials"]):
-        name, curve = row.trial, content["kinematics"].get(row.trial)
-        curve = None if curve is None or len(curve) < 2 else curve
-        kinds = ("strips", "motions", "flags")
+    for k, row in enumerate(rows(content["trials"])):
+        name, kinds = row.trial, ("strips", "motions", "flags")
         strip, motion, flags = (None if row.status == "failed" else content[kind].get(name) for kind in kinds)
-        strip = inline_picture(strip, f"s-{name}", f"Strip of {name} with its tracked edge")
-        motion = inline_picture(motion, f"t-{name}", f"Motion of {name}")
+        strip = inline_picture(strip, f"s{k}", f"Strip of {name} with its tracked edge")
+        motion = inline_picture(motion, f"t{k}", f"Motion of {name}")
         if weight + len(strip) + len(motion) > MAX_TRIAL_FIGURES_BYTES:
             left_out += bool(strip or motion)
             strip = motion = Markup()
@@ -496,7 +459,6 @@ def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int
         entry = {
             "row": row,
             "frames": count_frames(flags) if flags else "",
-            "data": "" if curve is None else data_uri(f"{name}.csv", _csv(curve.iloc[:: -(-len(curve) // most)])),
             "clip": content["clips"].get(name, ""),
             "windows": list(rows(windows[windows["trial"] == name])),
         }
@@ -563,14 +525,12 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
         known |= experiment.user_effects
-    moved, laws = (results.diagnosed(name) for name in ("moved.csv", "damping_laws.csv"))
     return {
         "name": experiment.name,
         "trials": trials,
         "windows": read_result(results.steady),
         "damping": read_json(results.damping),
         "provenance": provenance,
-        "kinematics": {name: read_result(results.kinematics(name)) for name in drawn},
         "figures": _figures(tables, campaign_figures().values()),
         "motions": {name: _picture(partial(results.trial_figure, name)) for name in drawn},
         "strips": {name: _picture(partial(results.strip_figure, name)) for name in filmed},
@@ -582,8 +542,6 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "comparison": read_result(results.comparison),
         "check": read_result(results.model_check),
         "diagnosis": diagnosis,
-        "moved": read_result(moved) if moved.exists() else None,
-        "laws": read_result(laws) if laws.exists() else None,
         "effects": known,
         "sections": sections,
         "notes": experiment.blank_notes,
@@ -662,7 +620,7 @@ def build_report(content: dict[str, Any]) -> str:
         for method in LAW_METHODS
         for vine, law in ((content["damping"].get(method) or {}).get("vines") or {}).items()
     ]
-    return environment.get_template("report.html").render(
+    page = environment.get_template("report.html").render(
         content
         | {
             "headline": damping_headline(content["damping"]),
@@ -680,3 +638,7 @@ def build_report(content: dict[str, Any]) -> str:
             "run": content["provenance"]["settings"],
         }
     )
+    # Each style of the figures stands once in the page, as a class.
+    styles: dict[str, str] = {}
+    page = re.sub(r' style="([^"-][^"]*)"', lambda m: f' class="{styles.setdefault(m[1], f"f{len(styles)}")}"', page)
+    return page.replace("</style>", "".join(f".{k} {{{style}}}" for style, k in styles.items()) + "</style>", 1)

@@ -40,7 +40,7 @@ class DiagnosisTables:
         self.worst = labels.get(worst, worst)
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
-        self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
+        self.ladder = none if (ladder := diagnosis and diagnosis.ladder) is None else found.get("steps.csv", ladder)
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
@@ -48,9 +48,8 @@ class DiagnosisTables:
         self.rounds: list[tuple[str, pd.DataFrame]] = []
         for i, ranked in enumerate(rounds):
             more = [name for name in ranked.model if name not in rounds[0].model]
-            heading = f"Which is missing with {listed_names(more)} added?"
-            heading = heading if i else "Which effect is missing from the initial model?"
-            self.rounds.append((heading, self.ranking[self.ranking["round"] == i + 1]))
+            heading = f"is missing with {listed_names(more)} added" if i else "effect is missing from the initial model"
+            self.rounds.append((f"Which {heading}?", self.ranking[self.ranking["round"] == i + 1]))
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:

@@ -104,6 +104,7 @@ class Results:
     audit = _File("audit.csv")  # Size of neglected effects along the motion of each trial
     diagnosis = _File("diagnosis.json")  # The diagnosis of the model in use
     ladder = _File("ladder.csv")  # Errors of the initial model and of each later model
+    steps = _File("diagnosis", "steps.csv")  # The ladder, below the steps of earlier runs to the model in use
     final_fit = _File("diagnosis", "final_fit.json")  # The fit with all added effects; exists only if there are any
     overlays = _File("overlays")  # Folder of the clips
     provenance = _File("provenance.json")  # Versions, settings and hashes of all inputs
@@ -134,7 +135,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise ResultsError(where) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         fault = str(error).partition("\n")[0] if isinstance(error, OSError | ValueError) else repr(error)
-        raise ResultsError(f"{path} cannot be read ({fault}): delete it and run snakemake again") from None
+        raise ResultsError(f"{path} cannot be read ({fault}): delete it and run `vinetrack run` again") from None
 
 
 def read_result(path: Path) -> pd.DataFrame:
@@ -248,7 +249,7 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
             return with_pressure_trace(trial, track)
         source_track = load_track(trial) if trial.track is not None else None
     except InputError as error:
-        raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
+        raise ResultsError(f"trial {trial.name}: {error}; then run `vinetrack run` again") from None
     if source_track is None or source_track.pressure_Pa is None:
         return track
     return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))

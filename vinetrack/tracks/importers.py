@@ -10,7 +10,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,8 @@ import numpy as np
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
-from vinetrack.core.units import UNITS, split_unit
+from vinetrack.core.terminal import table
+from vinetrack.core.units import UNITS, number, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
 
 if TYPE_CHECKING:
@@ -268,28 +269,29 @@ def _number(node: Element, name: str) -> float:
 
 
 # ------------------------------------------------------------------------------
-# Tables of points, a row a frame, as other programs write them: Tracker (`t, x, y`), trackpy (`y, x, …, frame,
-# particle`), DeepLabCut (`scorer`, `bodyparts`, `coords` above), Kinovea (`Time, ball/0/X, ball/0/Y`, or sections of
-# text), DLTdv (`pt1_cam1_X, …`, or `pt1_X, pt1_Y, pt1_Z`). What a file leaves open the sheet says: the rate by
-# `capture_fps`, the length of a pixel or of any other unit by `mm_per_px`. A note says what was taken for what.
+# Tables, a row a frame: your own (`time_s, position_m`, in any units), or of points as other programs write them:
+# Tracker (`t, x, y`), trackpy (`y, x, …, frame, particle`), DeepLabCut (`scorer`, `bodyparts`, `coords` above), Kinovea
+# (`Time, ball/0/X, ball/0/Y`, or sections of text), DLTdv (`pt1_cam1_X, …`, or `pt1_X, pt1_Y, pt1_Z`). What a file
+# leaves open the sheet says: the rate by `capture_fps`, the length of a pixel or of any other unit by `mm_per_px`. A
+# note says what was taken for what, unless the names of the columns do.
 
 _COLUMN = re.compile(
-    r"#?\s*(?:(.+?)[\s_/]+)?(t|time|frame|x|y|z|likelihood)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE
+    r"#?\s*(?:(.+?)[\s_/]+)?(t|time|frame|x|y|z|position|likelihood)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE
 )
 
 
 def _column(cell: str) -> tuple[str, str, str]:
-    """Point, quantity (t, frame, x, y, z, likelihood, or blank) and unit of a column.
+    """Point, quantity (t, frame, x, y, z, position, likelihood, or blank) and unit of a column.
 
-    >>> [_column(cell) for cell in ("x (cm)", "#t", "pt1_cam1_X", "ball/0/Y", "mass")]
-    [('', 'x', 'cm'), ('', 't', ''), ('pt1_cam1', 'x', ''), ('ball/0', 'y', ''), ('', '', '')]
+    >>> [_column(cell) for cell in ("x (cm)", "#t", "pt1_cam1_X", "ball/0/Y", "position_mm", "mass")]
+    [('', 'x', 'cm'), ('', 't', ''), ('pt1_cam1', 'x', ''), ('ball/0', 'y', ''), ('', 'position', 'mm'), ('', '', '')]
     """
     match = _COLUMN.fullmatch(cell.strip().strip('"').strip())
     return (match[1] or "", match[2].lower().replace("time", "t"), match[3] or "") if match else ("", "", "")
 
 
-def _points_table(text: str) -> Table | None:
-    """The table of points in a text, its header in one line; None where there is none."""
+def _table(text: str) -> Table:
+    """The table of positions in a text, its header in one line."""
     lines = text.split("\n")
     if lines[0].startswith("#Kinovea"):  # sections of lines `t x y`, each below `# name`
         name, table = "", ["t;particle;x;y"]
@@ -305,19 +307,19 @@ def _points_table(text: str) -> Table | None:
     for skip, line in enumerate(lines[:20]):  # a title and remarks may stand above the header (chosen)
         columns = [_column(cell) for cell in re.split(r"[\t;,]", line)]
         found = {quantity for _, quantity, _ in columns}
-        if found & {"x", "y"} and (found & {"t", "frame"} or columns[0][0].startswith("pt")):
+        if found & {"x", "y", "position"} and (found & {"t", "frame"} or columns[0][0].startswith("pt")):
             return parse_table(text, skip)
-    return None
+    remedy = "name them time_s and position_m (or in other units), or frame or t, and x, y or both"
+    found_names = ", ".join(parse_table(text).columns[:8])
+    raise InputError(f"has no columns of times and positions (found: {found_names[:120]})", remedy)
 
 
-def points_track(text: str, trial: Trial) -> Track:
-    """Read the track of a trial from a table of points, as text."""
-    if (table := _points_table(text)) is None:
-        raise InputError("has no columns of points", "they are frame or t, and x, y or both")
-    return _read_points(table, trial.point_mass, trial.capture_fps, trial.m_per_px)
+def table_track(text: str, trial: Trial) -> Track:
+    """Read the track of a trial from a table of positions, as text."""
+    return _read_table(_table(text), trial.point_mass, trial.capture_fps, trial.m_per_px)
 
 
-def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float) -> Track:
+def _read_table(table: Table, wanted: str, capture_fps: float, m_per_px: float) -> Track:
     """Read the track of one point: that of the name `wanted`, else that with the most places. A blank coordinate, or
     one that DeepLabCut finds unlikely, is a frame without a place.
     """
@@ -328,13 +330,12 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
         of, quantity, unit = _column(column)
         if quantity:
             columns.setdefault("clock" if quantity in ("t", "frame") else of, {}).setdefault(quantity, (column, unit))
-    clock, particle = (
-        columns.pop("clock", {}),
-        np.array([row.get("particle", "").removesuffix(".0") for row in table.rows]),
-    )
+    clock = columns.pop("clock", {})
+    particle = np.array([row.get("particle", "").removesuffix(".0") for row in table.rows])
     points = {}
     for of, given in columns.items():
-        if not (axes := [given[axis] for axis in "xyz" if axis in given]):
+        axes = [given["position"]] if "position" in given else [given[axis] for axis in "xyz" if axis in given]
+        if not axes:
             continue
         places = np.column_stack([table.numbers(column, blank_is_nan=True) for column, _ in axes])
         if "likelihood" in given:  # 0.6: from which DeepLabCut itself draws a point
@@ -362,18 +363,42 @@ def _read_points(table: Table, wanted: str, capture_fps: float, m_per_px: float)
     check_times(time_s, [table.lines[row] for row in rows])
 
     unit, scale = axes[0][1], m_per_px
+    # 10: no motion is measured in fewer pixels, and no vine of which they are taken is as long in metres (chosen)
+    is_small = np.max(np.nanmax(places, axis=0) - np.nanmin(places, axis=0)) <= 10
     if unit and unit.lower() not in ("px", "pixel", "pixels"):
         scale = _factor(unit, "m")
-    elif not unit and ("t" in clock or len(axes) == 3) and not (name and math.isfinite(m_per_px)):
+    elif not unit and ("t" in clock or len(axes) == 3) and (is_small or not math.isfinite(m_per_px)):
         unit, scale = "metres", 1.0
     elif not math.isfinite(m_per_px):
         raise InputError("has its places in pixels", "give the length of a pixel as mm_per_px")
-    position_m, projected = _project_on_axis(places * scale)
-    source = f"{' and '.join(column for column, _ in axes)} in {unit or f'units of {1e3 * scale:g} mm'}"
-    notes += [f"Places are taken from {source}, times from {column} in {time_unit}.", rounded, projected]
+    is_position = _column(axes[0][0])[1] == "position"
+    position_m, projected = (scale * places[:, 0], "") if is_position else _project_on_axis(places * scale)
+    taken = f"{' and '.join(column for column, _ in axes)} in {unit or f'units of {1e3 * scale:g} mm'}"
+    if not (is_position and axes[0][1] and clock.get("t", ("", ""))[1]):
+        notes.append(f"Places are taken from {taken}, times from {column} in {time_unit}.")
+    notes += [rounded, projected]
     if missing := int(np.sum(~np.isfinite(position_m))):
         notes.append(f"{missing} rows have no position.")
-    return new_track(time_s, position_m, list(filter(None, notes)))
+    sigma_m, pressure_Pa = (_beside(table, quantity, si)[rows] for quantity, si in (("sigma", "m"), ("pressure", "Pa")))
+    if np.any(sigma_m < 0):
+        raise InputError(f"line {table.lines[rows[np.argmax(sigma_m < 0)]]}, column sigma is negative", "correct it")
+    if np.any(sigma_m == 0):
+        notes.append("A sigma_m of 0 is taken as unknown.")
+    traced = np.isfinite(pressure_Pa)
+    check_pressure(pressure_Pa / 1000, [table.lines[row] for row in rows])
+    if traced.any() and not traced.all():
+        notes.append(f"Pressure is interpolated at {int(np.sum(~traced))} points where its cell is blank.")
+    trace_Pa = np.interp(time_s, time_s[traced], pressure_Pa[traced]) if traced.any() else None
+    sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
+    return new_track(time_s, position_m, list(filter(None, notes)), lead_position_sigma_m=sigma_m, pressure_Pa=trace_Pa)
+
+
+def _beside(table: Table, quantity: str, si: str) -> Floats:
+    """A column of another quantity in SI, such as `pressure_psi`; NaN where there is none. Shape (n_rows,)."""
+    for name in table.columns:
+        if (split := split_unit(name))[0] == quantity:
+            return table.numbers(name, blank_is_nan=True) * _factor(split[1], si)
+    return np.full(len(table.rows), np.nan)
 
 
 def _chosen(counts: Mapping[str, int], wanted: str) -> tuple[str, list[str]]:
@@ -486,21 +511,18 @@ def read_track(
     capture_fps: float = math.nan,
     m_per_px: float = math.nan,
 ) -> Track:
-    """Read positions measured elsewhere; the kind of file is recognised from its content: a CSV with `time_s,
-    position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`), or a table of points of another program.
+    """Read positions measured elsewhere; the kind of file is recognised from its content: a table with `time_s,
+    position_m[, sigma_m][, pressure_kPa]`, or of points of another program, or a Physics Tracker project (`.trk`).
     """
     if path.suffix.lower() == ".trz":
         raise InputError("is a packed Tracker project", "unpack it and name the .trk inside")
+    if path.suffix.lower() in (".nc", ".h5", ".hdf5"):
+        remedy = "export a CSV: save_as_csv=True in DeepLabCut, save_poses.to_dlc_file(ds, 'tip.csv') in movement"
+        raise InputError("is a netCDF or HDF5 file", remedy)
     text = read_text(path)
     if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
         return read_project(text, point_mass, frames_used)
-    table = _points_table(text)
-    if table is not None and "position_m" not in table.columns:
-        track = _read_points(table, point_mass, capture_fps, m_per_px)
-    elif point_mass:
-        raise InputError("has no points to choose from", "leave point_mass blank, or name a file with points")
-    else:
-        track = _read_positions(parse_table(text))
+    track = _read_table(_table(text), point_mass, capture_fps, m_per_px)
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
@@ -510,30 +532,18 @@ def read_track(
     return track.flagged(before, "rejected").flagged(after, "after_end")
 
 
-def _read_positions(table: Table) -> Track:
-    """Read a table of positions; every row of it is a row of the track."""
-    _require(table, "time_s", "position_m")
-    time_s, position_m = table.numbers("time_s"), table.numbers("position_m")
-    time_s, note = unrounded_times(time_s)
-    check_times(time_s, table.lines)
-    sigma_m, notes = np.full(len(time_s), np.nan), [note] if note else []
-    if "sigma_m" in table.columns:
-        sigma_m = table.numbers("sigma_m", blank_is_nan=True)
-        if np.any(sigma_m < 0):
-            line = table.lines[int(np.argmax(sigma_m < 0))]
-            raise InputError(f"line {line}, column sigma_m is negative", "correct it")
-        if np.any(sigma_m == 0):
-            notes.append("A sigma_m of 0 is taken as unknown.")
-            sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
-    pressure_Pa = None
-    if "pressure_kPa" in table.columns and any(row["pressure_kPa"] for row in table.rows):
-        pressure_kPa = table.numbers("pressure_kPa", blank_is_nan=True)
-        check_pressure(pressure_kPa, table.lines)
-        known = np.isfinite(pressure_kPa)
-        pressure_Pa = 1000 * np.interp(time_s, time_s[known], pressure_kPa[known])
-        if not known.all():
-            notes.append(f"Pressure is interpolated at {int(np.sum(~known))} points where its cell is blank.")
-    return new_track(time_s, position_m, notes, lead_position_sigma_m=sigma_m, pressure_Pa=pressure_Pa)
+def track_lines(tracks: Iterable[tuple[Trial, Track]]) -> list[str]:
+    """What was read of tracks as a table, and their notes; of those that differ only in numbers, the first."""
+    rows, told = [], dict[str, list[str]]()
+    for trial, track in tracks:
+        time_s, growth_m = track.time_s, float(np.ptp(track.lead_position_m[track.usable]))
+        facts = 1 / float(np.median(np.diff(time_s))), np.ptp(time_s), 1e3 * growth_m, 1e3 * trial.length_m
+        rows.append((trial.name, time_s.size, *(number(float(fact), 4) for fact in facts)))
+        for note in track.notes:
+            told.setdefault(re.sub(r"\d[\d.]*", "", note), []).append(f"{trial.name}: {note}")
+    head, units = ("track", "points", "rate", "lasts", "growth", "sheet"), ("", "", "1/s", "s", "mm", "mm")
+    lines = [f"{alike[0]}{f' (and {len(alike) - 1} more alike)' if alike[1:] else ''}" for alike in told.values()]
+    return [*table(rows, head, units, align="<>>>>>"), *lines] if rows else []
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
@@ -545,7 +555,9 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
         lines: Sequence[int] = range(1, len(time_s) + 1)
     else:
         table = read_table(path)
-        _require(table, "time_s", "pressure_kPa")
+        if missing := {"time_s", "pressure_kPa"} - {*table.columns}:
+            message = f"lacks the column {min(missing)} (found: {', '.join(table.columns[:8])[:120]})"
+            raise InputError(message, "name its columns time_s, pressure_kPa")
         time_s, pressure_Pa, lines = table.numbers("time_s"), 1000 * table.numbers("pressure_kPa"), table.lines
     if len(time_s) == 0:
         raise InputError("has no rows", "write time_s and pressure_kPa of at least one reading")
@@ -570,11 +582,3 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
     if outside:
         notes = (*notes, f"The pressure trace does not cover {outside} of {len(track.time_s)} points: its end is held.")
     return replace(track, pressure_Pa=np.interp(track.time_s, time_s, pressure_Pa), notes=notes)
-
-
-def _require(table: Table, *columns: str) -> None:
-    """Refuse a table that lacks one of these columns."""
-    if missing := [column for column in columns if column not in table.columns]:
-        present = ", ".join(table.columns[:8]) or "none"
-        message = f"lacks the column {missing[0]} (found: {present[:120]})"
-        raise InputError(message, f"name its columns {', '.join(columns)}")

@@ -13,14 +13,14 @@ export const row = () => state.sheet.rows[state.chosen];
 export const shownFrame = () => view.frame;
 
 export async function showRecording() {
-  const recording = row()?.video ?? "";
-  askedFor = recording;
+  const recording = askedFor = row()?.video ?? "";
   state.clip = null;
   view.source = "";
-  $("frame").disabled = true;
+  [$("frame").disabled, $("track").disabled] = [true, !recording];
   Object.assign(curve, {key: "", path_px: null, drawn: curve.asked});
   drawSources();
-  $("stage").replaceChildren(el("p", {class: "busy tool"}, recording ? `Decoding ${recording} …` : "No recording in this row."));
+  const none = row()?.track ? `${row().track} holds positions: there is no picture.` : "No recording in this row.";
+  $("stage").replaceChildren(el("p", {class: recording ? "busy tool" : "tool"}, recording ? `Decoding ${recording} …` : none));
   if (!recording) return;
   try {
     const clip = await ask(url("api/clip", {recording}));
