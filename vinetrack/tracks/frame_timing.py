@@ -273,11 +273,14 @@ def mean_speed(track: Track) -> float:
 
 
 def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
-    """Say which tracks are longer than their vine, whose tip cannot run farther; blank where none is."""
+    """Say which tracks are longer than their vine, whose tip cannot run farther, as a payload can that leaves it; blank
+    where none is.
+    """
     travels: list[tuple[Trial, float]] = []
     for trial, track in pairs:
         position_m = track.lead_position_m[track.usable]
-        if trial.travel_ratio != 1 and math.isfinite(trial.length_m) and position_m.size >= 5:
+        bare = trial.travel_ratio != 1 and trial.payload_kg == 0
+        if bare and math.isfinite(trial.length_m) and position_m.size >= 5:
             travels.append((trial, float(np.quantile(position_m, 0.99) - np.median(position_m[:3]))))
     # 1.05: travel, in lengths of the vine, that an error of length or scale of a few per cent leaves (chosen)
     longer = [(travel_m / one.length_m, one, travel_m) for one, travel_m in travels if travel_m > 1.05 * one.length_m]
