@@ -426,7 +426,6 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
     even the best force explains is counted as further noise: it inflates the variance of every independent residual.
     `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
-    n_independent = 10.0 * len(problem.data)  # Independent residuals where a model leaves more than noise (chosen)
     largest_N = 0.0
     for motion in point.motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
@@ -444,12 +443,12 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
             begin, end = end, end + law.n_amplitudes
             estimated.append((law, equations.estimate(slice(begin, end))))
         largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
+        noise = problem.inflation(chi2 - largest)
         ranked = []
         for law, estimate in estimated:
             # A factor counts as a parameter, because it was chosen among several.
             n_parameters = law.n_amplitudes + law.n_shapes + bool(law.factor)
-            bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(n_independent)
+            bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(problem.n_independent)
             ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
         best = {}
         for each in sorted(ranked, key=lambda law: (not law.is_detected, law.bic)):
