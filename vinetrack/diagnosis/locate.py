@@ -193,7 +193,7 @@ COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
 
 DRIFT_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
-    *("z", "z_constancy", "dof", "n_trials", "significant", "sentence"),
+    *("z", "dof", "n_trials", "significant", "sentence"),
 )
 GROUP_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
@@ -259,23 +259,20 @@ def _tested(
     subject: Row,
     levels: tuple[float, float],
     change: tuple[float, float],
-    p: tuple[float, ...],
+    p: float,
     dof: float,
     n_trials: int,
     groups: Sequence[Row] = (),
     **told: Any,
 ) -> Row:
     """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
-    its standard error. `p` are the p-values of a steady change and, where it is asked, of any; `told` is what the
-    sentence about it needs besides.
+    its standard error. `told` is what the sentence about it needs besides.
     """
     from scipy.stats import norm
 
-    z, z_constancy = (float(norm.isf(max(each, 1e-300) / 2)) for each in (p[0], p[-1]))
-    numbers = (*levels, *change, z, z_constancy, dof, n_trials)
+    numbers = (*levels, *change, float(norm.isf(max(p, 1e-300) / 2)), dof, n_trials)
     row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
-    sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
-    return row | {"sentence": sentence, "p": min(1.0, len(p) * min(p)), "groups": groups}
+    return row | {"sentence": remark("drifts", row=row, **told), "p": p, "groups": groups}
 
 
 # ------------------------------------------------------------------------------
@@ -341,15 +338,11 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
 
 
 # ------------------------------------------------------------------------------
-# Tests of whether B of single trials varies with a condition: linear trend and differences.
+# Tests of whether B of single trials changes with a condition: a linear trend.
 
 
 def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
-    """Tests against one condition, of each vine alone and of all: of a linear trend, and by Fisher's F test whether all
-    levels have the same mean, both about the mean of each vine.
-    """
-    from scipy.stats import f as fisher
-
+    """Tests of a linear trend against one condition, of each vine alone and of all, about the mean of each vine."""
     levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
     linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
     coordinate, weight, vines = levels if linear else np.log(levels), 1 / estimates.variance, estimates.vines
@@ -365,11 +358,6 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
         if steady is None:
             continue
         slope, sigma, p, variance, dof = steady
-        cells = [f"{name} {value!r}" for name, value in zip(block, level.tolist(), strict=True)]
-        between = len(set(cells)) - n_vines
-        means = d - _centred(d, w, np.array(cells))
-        chi2 = float(np.sum(w * means**2))
-        p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
         subject, groups = _subject(estimates.number, str(vine), against), []
         for value in np.unique(level).tolist() if n_vines == 1 else ():
             k = np.flatnonzero(chosen & (levels == value))
@@ -382,7 +370,7 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
         # Relative change from the smaller value, with its standard error
         larger = math.exp(abs(slope) * reach)
         change = larger - 1, larger * sigma * reach
-        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, (p, p_constancy), dof, d.size, groups)
+        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, p, dof, d.size, groups)
 
 
 def _steady_change(
@@ -436,4 +424,4 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
         subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
         change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
-        yield _tested(subject, levels, change, (p,), math.inf, n_trials, stated_sigma_Pa=stated)
+        yield _tested(subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated)

@@ -322,7 +322,7 @@ def _still_drifts(fit: Fit) -> Iterator[Remark]:
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return
     table = result.table
-    sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > CONTRADICTING_DRIFT_SIGMAS)]
+    sure = table[table["significant"] & (table["z"] > CONTRADICTING_DRIFT_SIGMAS)]
     for line in sure.drop_duplicates(["parameter", "against"])["sentence"]:
         yield remark("still_drifts", model=list(fit.model.names), drift=line)
 
