@@ -422,7 +422,7 @@ class ForceEquations:
         return products(columns[used], trial_data.first[used], relative_sd)
 
     def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
-        """Least squares for some of the coefficients, the others as they are. Misfit that they leave counts as noise."""
+        """Least squares for some of the coefficients, the others as they are; what they leave counts as noise."""
         information, score = self.information[columns, columns], self.score[columns]
         covariance = np.linalg.inv(information + np.diag(self.ridge[columns]))
         change, variance = covariance @ score, float(np.trace(covariance)) / score.size

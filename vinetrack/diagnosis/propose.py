@@ -28,7 +28,6 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
-    CandidateFits,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,
@@ -43,6 +42,7 @@ from vinetrack.diagnosis.missing_force import (
     RankedLaw,
     missing_force,
 )
+from vinetrack.diagnosis.selection import Search
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, own_effects, remember
 from vinetrack.inference.fit import refit
@@ -86,7 +86,7 @@ def add(
 def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
     """Fit a model with an effect added, as a diagnosis does; from the effect's own values where that gains nothing."""
     tests = misfit_tests(before, (effect,), FALSE_ALARM_LEVEL_FIRST_ROUND)
-    fits = [ratio.fit for ratio in CandidateFits(tests, report).fit(all_of_them=True)]
+    fits = [ratio.fit for ratio in Search(tests, report).extend(every=True)]
     if not fits or fits[0].log_likelihood < before.log_likelihood:
         fits.append(refit(before, before.model + effect))
     return max(fits, key=lambda fit: fit.log_likelihood)
