@@ -104,10 +104,10 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
     # What one vine answers alone adds up to what all answer.
     fit = said.fits[0]
     vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
-    asked = score_test.products_of(fit, score_test.shapes_of(FILM, [trial.trial for trial in fit.trials]))
-    assert [shape.group for shape in asked.shapes] == ["", *vines]
-    for trial, columns in zip(fit.trials, asked.columns, strict=True):
-        columns = columns[:, -asked.n_shapes :]
+    responses, _ = score_test._sensitivities(fit, score_test.shapes_of(FILM, [trial.trial for trial in fit.trials]))
+    assert [shape.group for shape, _ in responses] == ["", *vines]
+    for i, trial in enumerate(fit.trials):
+        columns = np.column_stack([moved[i] for _, moved in responses])
         alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
         assert np.any(alone.pop(trial.trial.vine))
         assert not any(np.any(of_other) for of_other in alone.values())

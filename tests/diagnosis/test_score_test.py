@@ -150,7 +150,7 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit = vt.effects.tail_friction, 0.05, 300.0
-    answers = score_test.Products((), (), None, 1, (score_test.CandidateShape(friction, (), 1e-3),))
+    answers = score_test.Products(None, None, (score_test.CandidateShape(friction, (), 1e-3),))
     held = []
     for _ in range(2000):
         one = scores(draw, trials, 1, sizes=true * unit)
@@ -162,15 +162,14 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     assert 0.92 < np.mean(held) < 0.99
 
 
-def test_systematic_errors_that_imitate_a_shape_are_integrated_out(monkeypatch):
+def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     columns = np.random.default_rng(20609).standard_normal((12, 40, 6))  # two errors, the residual, three shapes
     blocks = np.swapaxes(columns, 1, 2) @ columns
     places = np.tile([0, 1], (12, 1))
-    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda *_: blocks)
     arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
     problem = SimpleNamespace(index=places, places_of_pairs=np.tile([0, 1, 2, 4, 5, 6, 8, 9, 10], 12), **arrays)
-    products = SimpleNamespace(problem=problem, n_unknowns=2, n_shapes=3)
+    products = SimpleNamespace(problem=problem, n_unknowns=2, without_trial_effects=lambda _: blocks)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
     found = score_test.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)
     total = blocks.sum(axis=0)

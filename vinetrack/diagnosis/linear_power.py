@@ -319,7 +319,8 @@ def error_inflation(tests: MisfitTests) -> Floats:
     estimated, or from hundreds of trials. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
-    if len(tests.products.parts) > 1:
+    # 256: trials from which what the fit takes for scatter is not computed: it is little, and takes long (chosen)
+    if len(fit.trials) > 256:
         return np.ones((SCORE_GRID.size, len(scores.score)))
     # Factors on the between-trial standard deviations at which the information is computed (chosen)
     factors = [(1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0) if free else (1.0,) for free in estimable(fit.solution.problem)]

@@ -16,7 +16,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtri
@@ -29,15 +28,17 @@ from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.errors import cluster_variance, coarsest_groups
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names
-from vinetrack.inference.gaussian_processes import all_products
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
+    at_prior_means,
+    eliminated,
     inverse_of_block,
     summed,
-    trial_effects_eliminated,
+    trial_effect_prior,
 )
-from vinetrack.inference.sensitivity import position_change
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
 from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
@@ -292,15 +293,13 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 @dataclass(frozen=True)
 class Products:
-    """Columns of a fit, with its systematic errors, and of candidate shapes, shape (n_points, n_columns) a trial.
-    `problem` is that of the fit with the systematic errors as further parameters; `silent` names the effects to which
-    no trajectory responds at any plausible size.
+    """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the fit's
+    noise, shape (n_trials, n_columns, n_columns). `problem` is that of the fit with the systematic errors as further
+    parameters; `silent` names the effects to which no trajectory responds at any plausible size.
     """
 
-    columns: tuple[Floats, ...]
-    data: Sequence[FitTrial]
+    white: Floats
     problem: MixedProblem
-    n_shapes: int
     shapes: tuple[CandidateShape, ...] = ()
     silent: tuple[str, ...] = ()
 
@@ -314,55 +313,29 @@ class Products:
         """Number of columns of the unknowns of a trial."""
         return self.problem.index.shape[1]
 
-    @cached_property
-    def parts(self) -> list[slice]:
-        """Slices of the trials whose cross products are held at once."""
-        trials_at_once = 256  # Trials whose cross products are held at once, each of half a megabyte (chosen)
-        return [slice(begin, begin + trials_at_once) for begin in range(0, len(self.columns), trials_at_once)]
+    def without_trial_effects(self, state: FitState) -> Floats:
+        """Those of unknowns, residual and shapes, the trial effects integrated out."""
+        restored = at_prior_means(self.white, self.problem, state, N_TRIAL_EFFECTS + self.n_unknowns)
+        return eliminated(restored, trial_effect_prior(self.problem, state)[1])[0]
 
-    def cross_products(self, part: slice) -> Floats:
-        """Cross products of a part of the trials, see `gaussian_processes`. They are cached where there is only one
-        part; those of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
-        """
-        return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 
-    @cached_property
-    def _all_cross_products(self) -> Floats:
-        return self._cross_products_of(self.parts[0])
-
-    def _cross_products_of(self, part: slice) -> Floats:
-        data = self.data[part]
-        first = [trial_data.first for trial_data in data]
-        relative = [trial_data.relative_sd for trial_data in data]
-        return all_products(self.columns[part], first, relative)
+def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
+    """Cross products of columns of one trial in units of its noise. Shapes: columns (n_points, k) → (k, k)."""
+    trial_data, state = fit.predictor.data[i], fit.state
+    white = whiten(columns, trial_data.first, state.rho, trial_data.relative_sd)
+    return np.asarray(white.T @ white / state.variance[i])
 
 
 def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
-    """Assemble the columns of a fit, of its systematic errors and of the candidates; no trial's are held twice."""
+    """Cross products of a fit, of its systematic errors and of the candidates; no trial's columns are held twice."""
     responses, silent = _sensitivities(fit, shapes)
-    systematics = systematics_of(fit.predictor, fit.solution)
-    of_fit, problem = systematics.beside(fit.solution.columns), systematics.among(fit.solution.problem)
-    assembled: list[Floats] = []
-    for i, columns_of_trial in enumerate(of_fit):
-        assembled.append(np.column_stack([columns_of_trial, *(moved[i] for _, moved in responses)]))
+    systematics, white = systematics_of(fit.predictor, fit.solution), list[Floats]()
+    for i, of_fit in enumerate(systematics.beside(fit.solution.columns)):
+        white.append(in_noise(fit, i, np.column_stack([of_fit, *(moved[i] for _, moved in responses)])))
         for _, moved in responses:
             moved[i] = np.empty(0)
-    responding = tuple(shape for shape, _ in responses)
-    return Products(tuple(assembled), fit.predictor.data, problem, len(responding), responding, tuple(silent))
-
-
-def products_without_trial_effects(products: Products, state: FitState) -> Floats:
-    """Cross products of unknowns, residual and shapes of every trial, its trial effects integrated out. Shape
-    (n_trials, n_unknowns + 1 + n_shapes, the same again).
-    """
-    size = products.n_unknowns + 1 + products.n_shapes
-    blocks = np.empty((len(products.columns), size, size))
-    for part in products.parts:
-        of_part = replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part])
-        blocks[part] = trial_effects_eliminated(
-            products.cross_products(part), products.n_unknowns, products.problem.of_trials(part), of_part
-        )
-    return blocks
+    problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
+    return Products(np.stack(white), problem, responding, tuple(silent))
 
 
 @dataclass(frozen=True)
@@ -437,17 +410,17 @@ class Scores:
 
 
 def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
-    """Compute the scores at a fit, or with another state of its noise: shapes and residual with the trial effects
+    """Compute the scores at a fit, or with other between-trial scatter: shapes and residual with the trial effects
     eliminated and the unknowns projected off.
     """
     state, problem, p = state or fit.state, products.problem, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
-    blocks = products_without_trial_effects(products, state)
+    blocks = products.without_trial_effects(state)
     # Systematic errors are at their prior means.
     unknowns = np.append(state.theta, problem.prior_mean[state.theta.size :])
     hessian, gradient, _ = summed(np.ascontiguousarray(blocks[:, : p + 1, : p + 1]), problem, unknowns)
     # Unknowns to which a trial does not respond are added up in a last row, and dropped.
-    cross = np.zeros((problem.prior_mean.size + 1, products.n_shapes))
+    cross = np.zeros((problem.prior_mean.size + 1, blocks.shape[-1] - p - 1))
     np.add.at(cross, problem.index, blocks[:, X, C])
     total = blocks[:, C, C].sum(axis=0)
     # Those adapt to an effect that are estimated and not at a bound.
