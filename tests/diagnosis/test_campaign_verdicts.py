@@ -27,9 +27,8 @@ from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import result, score_test
 from vinetrack.diagnosis.force_inversion import ForceEstimate
-from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
-from vinetrack.diagnosis.missing_force import RankedLaw
+from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.replicates import with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions

@@ -76,41 +76,36 @@ def noiseless_start(fit: Fit) -> Fit:
 
 
 def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) -> tuple[Floats, Floats]:
-    """Sizes of an effect, and the ratios of its expected scores there to those of linear theory. Where the score at
-    seven units, above any threshold, agrees with linear theory, no other size is computed. Shape (n_sizes,) each.
+    """Sizes of an effect and the ratios of its expected scores there to those of linear theory, up to a score above any
+    threshold. Shape (n_sizes,) each.
     """
-    largest = 2.0  # Ratio of an expected score to that of linear theory from which neither is used (chosen)
-    multiples, ratios = [7.0], [score_ratio(tests, shape_index, 7.0 * unit, start)]
-    # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
-    if not 0 < abs(ratios[0] - 1) < 0.02:
-        multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4.0 * unit, start), *ratios]
-        if not all(0 < ratio < largest for ratio in ratios):
-            return unit * np.array(multiples), np.ones(2)
-        # 7.0: expected score from which no larger size is tried (chosen)
-        # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
-        while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
-            ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
-            if ratio == 1 or not 0 < ratio < largest:
-                break
-            multiples.append(2 * multiples[-1])
-            ratios.append(ratio)
-    return unit * np.array(multiples), np.array(ratios)
+    multiples, ratios = list[float](), list[float]()
+    # (4.0, …): multiples of the size of one standard error at which the score is computed (chosen)
+    for multiple in (4.0, 7.0, 14.0, 28.0, 56.0):
+        ratio = score_ratio(tests, shape_index, multiple * unit, start)
+        # 2.0: ratio of an expected score to that of linear theory from which neither is used (chosen)
+        if not 0 < ratio < 2.0:
+            break
+        multiples.append(multiple)
+        ratios.append(ratio)
+        # 6.5: expected score from which no larger size is tried (chosen)
+        if ratio * multiple > 6.5:
+            break
+    return unit * np.array(multiples or [7.0]), np.array(ratios or [1.0])
 
 
 def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -> float:
-    """Expected score of an effect at a size, divided by that of linear theory. Returns 1 where the trajectories with
-    the effect cannot be simulated, or the fit without it does not converge.
+    """Expected score of an effect at a size, divided by that of linear theory. NaN where the trajectories with the
+    effect cannot be simulated, or the fit without it does not converge.
     """
     shape, sigma = tests.products.shapes[shape_index], float(tests.scores.plain_sigma[shape_index])
     try:
         refit = fitted_without(start, shape, size)
-        if not refit.solution.converged:
-            return 1.0
         scores = scores_of(refit, products_of(refit, [shape]))
-        if not scores.score.size:
-            return 1.0
     except (SimulationError, np.linalg.LinAlgError):
-        return 1.0
+        return math.nan
+    if not refit.solution.converged or not scores.score.size:
+        return math.nan
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 

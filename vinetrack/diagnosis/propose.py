@@ -23,7 +23,6 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.force_laws import FORMS, STATE
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
@@ -34,8 +33,10 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import (
+    FORMS,
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
+    STATE,
     VARIABLES,
     Domain,
     LearnedForce,

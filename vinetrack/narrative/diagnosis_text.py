@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
-    from vinetrack.diagnosis.force_laws import Law
-    from vinetrack.diagnosis.missing_force import LearnedForce
+    from vinetrack.diagnosis.missing_force import Law, LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.inference.fit_result import Fit
