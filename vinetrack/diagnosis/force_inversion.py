@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials, replicate_scatter, residual_courses
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial
@@ -326,7 +326,7 @@ class ForceProblem:
 
     def __init__(self, fit: Fit) -> None:
         self.fit, self.data, self.prior = fit, fit.predictor.data, fit.solution.problem
-        self.scatter = replicate_scatter(fit, residual_courses(align_trials(fit)))
+        self.scatter = align_trials(fit).scatter
         rho = track_correlation(self.data)
         noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - rho**2)
         least, scatter = LEAST_BETWEEN_TRIAL_SD, self.scatter

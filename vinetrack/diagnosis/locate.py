@@ -8,9 +8,10 @@ thousand frames of one trial are one trial.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,12 +28,9 @@ from vinetrack.diagnosis.replicates import (
     Scatter,
     Stretches,
     align_trials,
-    by_condition,
     common_stretches,
     orthogonal_part,
-    replicate_scatter,
     replicates_by_condition,
-    residual_courses,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
@@ -95,13 +93,12 @@ def locate(fit: Fit) -> Failure:
     import pandas as pd
 
     aligned = align_trials(fit)
-    courses = residual_courses(aligned)
-    scatter, together = replicate_scatter(fit, courses), replicates_by_condition(aligned.trials)
-    rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in by_condition(courses).items()]
+    courses, together = aligned.courses, replicates_by_condition(aligned.trials)
+    rows = [_condition_row(together[name], common_stretches(courses[name]), aligned.scatter) for name in courses]
     return Failure(
         pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_position=_residual_along_growth(courses, scatter),
+        along_position=_residual_along_growth(courses, aligned.scatter),
         drift=drift(fit, aligned),
     )
 
@@ -142,16 +139,17 @@ def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter)
     }
 
 
-def _residual_along_growth(courses: Sequence[ResidualCourse], scatter: Scatter) -> pd.DataFrame:
+def _residual_along_growth(courses: Mapping[str, Sequence[ResidualCourse]], scatter: Scatter) -> pd.DataFrame:
     """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
     its standard error.
     """
     import pandas as pd
 
     rows: list[tuple[object, ...]] = []
-    for condition, members in by_condition(courses).items():
+    for condition, members in courses.items():
         vine = members[0].trial.vine
-        reach_m = max(float(course.lead_position_m.max()) for course in courses if course.trial.vine == vine)
+        of_vine = [course for course in itertools.chain(*courses.values()) if course.trial.vine == vine]
+        reach_m = max(float(course.lead_position_m.max()) for course in of_vine)
         edges = np.linspace(0.0, reach_m, MAX_STRETCHES + 1)
         in_stretches = [member.means("lead_position_m", edges) for member in members]
         means_m = np.array([means for means, _ in in_stretches])
