@@ -21,7 +21,8 @@ TRIPLE = -1000.0
 
 
 def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> LikelihoodRatio:
-    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers, trials=NAMES)
+    known = {"numbers": numbers, "trials": NAMES, "predictor": SimpleNamespace(data=())}
+    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), **known)
     return LikelihoodRatio(tuple(map(find_effect, names)), fit, 0.0, 0.0, True, Remark(), inflation=inflation)
 
 

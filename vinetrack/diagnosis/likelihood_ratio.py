@@ -6,9 +6,9 @@ The answer set holds every hypothesis that the data cannot exclude. Which are fi
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, MutableMapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincc, ndtri_exp
@@ -267,31 +267,17 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
 
 
 # ------------------------------------------------------------------------------
-# Memory of a search over hypotheses about many trials: curves of fits that no longer compete are dropped.
+# Memory of a search over hypotheses about many trials: it keeps fits without their curves.
 #
 # The curves of a fit to a thousand trials of 550 frames take some sixty megabytes, its misfit tests 700, and a search
-# makes dozens of fits. Numbers, likelihood and state of a fit always stay; its curves are computed again from them
-# where a later step needs them.
-
-
-Key = TypeVar("Key")
+# makes dozens of fits. Numbers, likelihood and state of a fit stay; its curves are computed again from them where a
+# later step needs them.
 
 
 def is_large(fit: Fit) -> bool:
-    """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole."""
-    # 150_000: points of all trials from which curves are dropped (chosen)
+    """Whether a fit has so many points that the fits of a search cannot be kept whole."""
+    # 150_000: points of all trials from which curves are let go (chosen)
     return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > 150_000
-
-
-def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
-    """Drop the curves of hypotheses that can no longer enter an answer set."""
-    ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
-    # 8: fits, the likeliest of a search, that are kept whole (chosen)
-    for key, hypothesis in ranked[8:]:
-        fit = hypothesis.fit
-        deviance_excess = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
-        if fit.trials and deviance_excess > OUT_OF_REACH and is_large(fit):
-            fitted[key] = replace(hypothesis, fit=without_curves(fit))
 
 
 def without_curves(fit: Fit) -> Fit:

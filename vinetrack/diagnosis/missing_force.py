@@ -588,7 +588,6 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
     even the best force explains is counted as further noise: it inflates the variance of every independent residual.
     `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
-
     largest_N = 0.0
     for motion in point.motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)

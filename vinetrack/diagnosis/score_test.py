@@ -361,10 +361,15 @@ class Scores:
         return float(max(min(spare, clusters - 1), 1))
 
     @property
+    def informed(self) -> Floats:
+        """Information about every size alone; NaN where the data hold none."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, diagonal, math.nan)
+
+    @property
     def size(self) -> Floats:
         """One-step estimate of every size, each alone; 0 where the data hold no information."""
-        diagonal = np.diag(self.information)
-        return np.where(diagonal > 0, self.score / np.maximum(diagonal, 1e-300), 0.0)
+        return np.nan_to_num(self.score / self.informed)
 
     @property
     def sigma(self) -> Floats:
@@ -374,18 +379,16 @@ class Scores:
     @property
     def plain_sigma(self) -> Floats:
         """Standard error from the noise and the between-trial standard deviations of the fit."""
-        diagonal = np.diag(self.information)
-        return np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), math.inf)
+        return np.nan_to_num(1 / np.sqrt(self.informed), nan=math.inf)
 
     @property
     def robust_sigma(self) -> Floats:
         """Cluster-robust standard error, from the scatter of trial scores about what the size predicts. 0 for few
         trials, see `cluster_variance`.
         """
-        diagonal = np.diag(self.information)
         residual = self.trial_scores - self.trial_informations * self.size
         scatter = np.sqrt(cluster_variance(residual, self.fitted, self.groups))
-        return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
+        return np.nan_to_num(scatter / self.informed, nan=math.inf)
 
     def one_sided(self, signs: Sequence[int]) -> Floats:
         """Score of every shape in standard errors (z) where its sign, 0 for either, is allowed; 0 where it is not. The

@@ -25,7 +25,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     LikelihoodRatio,
     answer_set,
     best_of,
-    drop_curves,
     full_fit,
     in_sigmas,
     is_large,
@@ -34,6 +33,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     sizes_of,
     start_values,
     with_curves,
+    without_curves,
 )
 from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
@@ -210,12 +210,12 @@ class Search:
         return tuple(step for step in steps if step is not None)
 
     def _keep_best(self, hypothesis: LikelihoodRatio) -> None:
-        """Keep a set unless a fit of the same effects with a higher likelihood is known; drop curves not needed."""
+        """Keep a set unless a fit of the same effects with a higher likelihood is known."""
         names = frozenset(hypothesis.names)
         known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
-            self.fitted[names] = hypothesis
-            drop_curves(self.fitted)
+            fit = hypothesis.fit
+            self.fitted[names] = replace(hypothesis, fit=without_curves(fit)) if is_large(fit) else hypothesis
 
 
 def _worth(larger: LikelihoodRatio, smaller: LikelihoodRatio, added: Sequence[Effect]) -> float:
@@ -251,12 +251,14 @@ def adequate_hypotheses(
             continue
         if hypothesis not in answer_set([*adequate, hypothesis])[0]:
             continue
-        tests = search.tests_after(hypothesis.fit) if hypothesis.credible else None
+        if not hypothesis.credible:
+            rejected[hypothesis.label] = hypothesis.reason
+            continue
+        tests = search.tests_after(hypothesis.fit)
+        hypothesis = replace(hypothesis, fit=tests.fit)
         # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
         # first round, which rejects more readily.
-        if tests is None:
-            rejected[hypothesis.label] = hypothesis.reason
-        elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
+        if tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
             rejected[hypothesis.label] = MISFIT_REMAINS
         elif len(hypothesis.effects) > 2 and (reason := search.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
@@ -465,7 +467,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         best = best_of(hypotheses) if hypotheses else None
         if not every and nothing_rejects and (best is None or best.sigma < SEARCH_SIGMAS):
             return nothing_found()
-        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(best.fit))):
+        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(with_curves(best.fit)))):
             continue
         if is_significant(best):
             adequate, rejected, after = adequate_hypotheses(hypotheses, search)
