@@ -20,7 +20,7 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.misfit_tests import LARGEST_MISSED
+from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
 from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -37,7 +37,6 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.score_test import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
 from vinetrack.diagnosis.selection import SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError

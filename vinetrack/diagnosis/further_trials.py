@@ -24,9 +24,8 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
-from vinetrack.diagnosis.misfit_tests import MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import Products, in_noise
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.diagnosis.misfit_tests import CandidateShape, is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
-from vinetrack.diagnosis.score_test import CandidateShape, is_plausible
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect

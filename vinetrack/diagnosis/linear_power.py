@@ -30,19 +30,17 @@ from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     PROBE_LEVEL,
+    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     misfit_tests,
-)
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
-from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.diagnosis.score_test import (
-    CandidateShape,
     plausible_range,
     products_of,
     scores_of,
     testable,
 )
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
+from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.effects import Effect, EffectError

@@ -40,13 +40,14 @@ from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
+    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     has_excess_scatter,
     misfit_tests,
+    plausible_range,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
-from vinetrack.diagnosis.score_test import CandidateShape, plausible_range
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
 from vinetrack.diagnosis.between_trials import BETWEEN, N_BY_VINE, ORDER_DRIFT, SPECIMEN
+from vinetrack.diagnosis.misfit_tests import slip_of
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -24,7 +25,6 @@ from vinetrack.diagnosis.result import (
     UNEXPLAINED,
     Confounder,
 )
-from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
