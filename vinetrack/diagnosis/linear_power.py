@@ -246,11 +246,12 @@ def _effect_power(
     if not means[-1] > 0:
         return None
     needed = np.quantile(_required_means(tests, index, inflation[:, index]), PROBABILITIES)
-    # The sizes at which the score has these means: proportional below the first size and beyond the last
-    between = np.interp(needed, [0.0, *means], [0.0, *sizes])
-    steps = np.where(needed >= means[-1], sizes[-1] * needed / means[-1], between)
-    at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
-    taken_for = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
+    # The sizes at which the score has these means, and the expected scores of all shapes at that of 90 %
+    steps = _along(needed, means, sizes)
+    at_90, taken_for = steps[PROBABILITIES.index(0.9)], dict[str, float]()
+    if math.isfinite(at_90):
+        there = np.array([_along(np.abs(at_90), np.abs(sizes), of_shape) for of_shape in scores.T])
+        taken_for = _confusion(tests, effect, there, null_scores)
     zero, of_size = 0.0, {"parameter": "", "symbol": "size", "unit": "1"}
     if effect.parameters:
         size = shape.size
@@ -268,14 +269,9 @@ def _effect_power(
     )
 
 
-def _scores_at(sizes: Floats, scores: Floats, size: float) -> Floats:
-    """Expected scores of all shapes at a size: interpolated, and proportional beyond the last; NaN for no size."""
-    if not math.isfinite(size):
-        return np.full(scores.shape[1], math.nan)
-    away = np.concatenate([[0.0], np.abs(sizes)])
-    if size > away[-1]:
-        return np.asarray(scores[-1] * size / away[-1])
-    return np.array([np.interp(size, away, [0.0, *column]) for column in scores.T])
+def _along(at: Floats, x: Floats, y: Floats) -> Floats:
+    """A curve from 0 through these points, straight between them, proportional beyond the last. Shapes: x, y (n,)."""
+    return np.asarray(np.where(at >= x[-1], y[-1] * at / x[-1], np.interp(at, [0.0, *x], [0.0, *y])))
 
 
 def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats:
@@ -333,8 +329,6 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     candidate exceeds its threshold. A score counts where its size is credible, see `likelihood_ratio`; an effect that
     contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
     """
-    if np.isnan(mean).any():
-        return {}
     drawn, effects = null_scores + mean, np.array(tests.products.effects)
     far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.products.shapes]
     with np.errstate(invalid="ignore"):

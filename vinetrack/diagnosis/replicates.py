@@ -378,16 +378,6 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
     )
 
 
-def common_edges(members: Sequence[ResidualCourse]) -> Floats:
-    """Edges of stretches of time that every replicate was recorded in. Shape (n_stretches + 1,)."""
-    start = max(float(member.time_s[0]) for member in members)
-    end = min(float(member.time_s[-1]) for member in members)
-    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
-    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
-    count = max(min(MAX_STRETCHES, frames // 2), 1)
-    return np.linspace(start, max(end, start), count + 1)
-
-
 class Stretches(NamedTuple):
     """Stretches of time that all replicates of a condition cover: mean residuals, shape (n_trials, n), their responses
     to pressure and ln B, (n, 2), and their covariance from the noise of the tracks alone, (n, n).
@@ -399,8 +389,13 @@ class Stretches(NamedTuple):
 
 
 def common_stretches(members: Sequence[ResidualCourse]) -> Stretches:
-    """The stretches in which all members have frames."""
-    parts = [member.means("time_s", common_edges(members)) for member in members]
+    """The stretches in which all members have frames, of the time that all were recorded in."""
+    start = max(float(member.time_s[0]) for member in members)
+    end = min(float(member.time_s[-1]) for member in members)
+    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
+    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
+    edges = np.linspace(start, max(end, start), max(min(MAX_STRETCHES, frames // 2), 1) + 1)
+    parts = [member.means("time_s", edges) for member in members]
     all_means = np.array([means for means, _ in parts])
     reached = np.isfinite(all_means).all(axis=(0, 2))
     noise = [member.noise(count[reached]) for member, (_, count) in zip(members, parts, strict=True)]
