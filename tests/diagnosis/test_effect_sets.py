@@ -10,7 +10,7 @@ from scipy.stats import chi2, norm
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark
-from vinetrack.diagnosis import misfit_tests, result, selection
+from vinetrack.diagnosis import result, selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
 from vinetrack.diagnosis.selection import Search
@@ -27,7 +27,7 @@ def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> Like
 
 
 def sets_of(known: list[LikelihoodRatio], thresholds=None) -> Search:
-    family = misfit_tests.FamilyTest(3.9, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
+    family = dict.fromkeys(NAMES, 4.0) | dict(thresholds or {})
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
     search = Search(tests, lambda _line: None)
     search.tests_after = lambda _fit: after

@@ -218,7 +218,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         z = tests.best_z(effect.name)
         if effect.name in tests.products.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
-        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
+        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family[effect.name]:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
         else:
             # An effect that contains one of the answer set can fit no worse, and need not be fitted.

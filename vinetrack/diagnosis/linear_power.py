@@ -279,7 +279,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     model, and that of Student's t with the standard error found from the scatter of single trials.
     """
     scores = tests.scores
-    limit = tests.family.threshold(tests.products.effects[index])
+    limit = tests.family[tests.products.effects[index]]
     passes = SCORE_GRID / inflation >= limit
     threshold = float(SCORE_GRID[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
@@ -336,7 +336,7 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     counted = np.maximum(np.where(credible, _sided(drawn, tests.signs), 0.0), 0.0) ** 2
     names = list(dict.fromkeys(tests.products.effects))
     squares = np.stack([counted[:, effects == name].max(axis=1) for name in names], axis=1)
-    limits = np.array([tests.family.threshold(name) for name in names])
+    limits = np.array([tests.family[name] for name in names])
     alarm = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(alarm) < DRAWS / 100:
         return {}

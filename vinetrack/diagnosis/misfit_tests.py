@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -469,34 +470,24 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
 # effectively independent.
 
 
-@dataclass(frozen=True)
-class FamilyTest:
-    """Thresholds of all candidates, in standard deviations of a score; `thresholds` are by name of effect."""
-
-    single_shape_threshold: float  # of a candidate with one shape and a size of either sign
-    thresholds: Mapping[str, float]
-
-    def threshold(self, name: str) -> float:
-        """Threshold of a candidate; of one without shapes, that of a single two-sided score."""
-        return self.thresholds.get(name, self.single_shape_threshold)
-
-
-def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
-    """Thresholds that any candidate exceeds with a probability of about `level`, less where candidates are alike.
-    Shapes: cosines (n_shapes, n_shapes).
+def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> defaultdict[str, float]:
+    """Thresholds of candidates, by name, in standard deviations of a score, that any exceeds with a probability of
+    about `level`, less where candidates are alike. A candidate without shapes has that of a single score of either
+    sign. Shapes: cosines (n_shapes, n_shapes).
     """
     informative = np.diag(cosines) > 0
     shapes = {name: [k for k, other in enumerate(effects) if other == name and informative[k]] for name in effects}
     shapes = {name: of_effect for name, of_effect in shapes.items() if of_effect}
     share = level / max(len(shapes), 1)
-    thresholds = {}
+    single = -float(ndtri(share / 2))
+    thresholds = defaultdict(lambda: single)
     for name, of_effect in shapes.items():
         sides = 2 if signs[of_effect[0]] == 0 else 1
         # Effective number of independent shapes: Galwey, Genetic Epidemiology 33, 559 (2009).
         eigenvalues = np.maximum(np.linalg.eigvalsh(cosines[np.ix_(of_effect, of_effect)]), 0.0)
         count = float(np.sum(np.sqrt(eigenvalues)) ** 2 / np.sum(eigenvalues))
         thresholds[name] = -float(ndtri(share / sides / count))
-    return FamilyTest(-float(ndtri(share / 2)), thresholds)
+    return thresholds
 
 
 # ------------------------------------------------------------------------------
@@ -530,7 +521,7 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 def any_probe_exceeds(scores: Scores, level: float) -> bool:
     """Whether the score of some probe exceeds the threshold of so many bumps, of either sign."""
     signs, names = [0] * scores.score.size, ["probe"] * scores.score.size
-    threshold = family_test(scores.cosines, signs, names, level).threshold("probe")
+    threshold = family_test(scores.cosines, signs, names, level)["probe"]
     return bool(np.max(scores.one_sided(signs), initial=0.0) > threshold)
 
 
@@ -659,14 +650,14 @@ class MisfitTests:
         return [shape.size.sign if shape.effect.parameters else 1 for shape in self.products.shapes]
 
     @cached_property
-    def family(self) -> FamilyTest:
+    def family(self) -> defaultdict[str, float]:
         """Thresholds of z for the candidates, such that any exceeds its own by chance with probability `level`."""
         return family_test(self.scores.cosines, self.signs, self.products.effects, self.level)
 
     def any_exceeds(self, level: float) -> bool:
         """Whether any candidate exceeds its threshold at a level that all of them share."""
         family = family_test(self.scores.cosines, self.signs, self.products.effects, level)
-        thresholds = np.array([family.threshold(name) for name in self.products.effects])
+        thresholds = np.array([family[name] for name in self.products.effects])
         return bool(np.any(self.one_sided_z > thresholds))
 
     @property

@@ -180,7 +180,7 @@ class Search:
             others = [other for other in hypothesis.effects if other is not effect]
             if (smaller := self.subset(hypothesis, others, again=True)) is not None:
                 sigmas = _worth(hypothesis, smaller, (effect,))
-                required = max(required, self.tests_after(smaller.fit).family.threshold(effect.name))
+                required = max(required, self.tests_after(smaller.fit).family[effect.name])
             if sigmas < required:
                 return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
         return Remark()
@@ -193,7 +193,7 @@ class Search:
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
         family = self.tests_after(smaller.fit).family
         added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
-        return _worth(hypothesis, smaller, added) >= max(family.threshold(effect.name) for effect in added)
+        return _worth(hypothesis, smaller, added) >= max(family[effect.name] for effect in added)
 
     def partial_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant;
@@ -458,7 +458,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=differ)]
 
     def is_significant(hypothesis: LikelihoodRatio) -> bool:
-        return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
+        return hypothesis.sigma >= tests.family[hypothesis.names[-1]]
 
     # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
     # from it. Nothing is left to gain once the residuals of the best are no larger than the errors of the tracks and
