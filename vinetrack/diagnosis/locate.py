@@ -31,6 +31,7 @@ from vinetrack.diagnosis.replicates import (
     common_stretches,
     orthogonal_part,
     replicates_by_condition,
+    within_groups,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
@@ -344,13 +345,15 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
     levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
     linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
     coordinate, weight, vines = levels if linear else np.log(levels), 1 / estimates.variance, estimates.vines
-    usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
+    known = np.isfinite(estimates.deviation)
+    usable = np.isfinite(levels) & known
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    replicates = _of_replicates(estimates.deviation, weight, estimates.conditions)
+    apart, dof = within_groups(estimates.deviation[known], estimates.conditions[known], weight[known])
+    replicates = float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
     for vine in [*varying, *([""] if len(varying) > 1 else [])]:
         chosen = usable & (np.isin(vines, varying) if vine == "" and len(varying) > 1 else vines == vine)
         w, block, level = weight[chosen], vines[chosen], levels[chosen]
-        x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
+        x, d = (within_groups(values[chosen], block, w)[0] for values in (coordinate, estimates.deviation))
         n_vines = np.unique(block).size
         steady = _steady_change(x, d, w, replicates, n_vines)
         if steady is None:
@@ -391,20 +394,6 @@ def _steady_change(
     variance = max(variance, LEAST_SCATTER**2)
     sigma = math.sqrt(variance / square)
     return slope, sigma, float(2 * student.sf(abs(slope) / sigma, dof)), variance, dof
-
-
-def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
-    """Deviations from the weighted mean of each group. Shapes: values, weight, groups (n,) → (n,)."""
-    _, group = np.unique(groups, return_inverse=True)
-    return np.asarray(values - (np.bincount(group, weight * values) / np.bincount(group, weight))[group])
-
-
-def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_]) -> tuple[float, int]:
-    """Variance of replicates about the mean of their condition, relative to 1/weight, and its degrees of freedom."""
-    known = np.isfinite(values)
-    dof = int(np.count_nonzero(known)) - np.unique(conditions[known]).size
-    apart = _centred(values[known], weight[known], conditions[known])
-    return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
 
 
 def against_the_sheet(fit: Fit) -> Iterator[Row]:

@@ -26,6 +26,7 @@ from scipy.special import ndtri
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.replicates import within_groups
 from vinetrack.dynamics.model import Model, check_needs, probe, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
@@ -581,12 +582,11 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     """
     from scipy.stats import f
 
-    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
-    mean = np.bincount(group, values) / count
-    inner, outer = values.size - count.size, count.size - fitted
+    apart, inner = within_groups(values, groups)
+    outer = values.size - inner - fitted
     if inner < MIN_REPLICATE_DEGREES or outer < 1:
         return math.nan
-    within, between = float(np.sum((values - mean[group]) ** 2)), float(np.sum(count * mean**2))
+    within, between = float(np.sum(apart**2)), float(np.sum((values - apart) ** 2))
     if not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².

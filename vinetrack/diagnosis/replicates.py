@@ -18,6 +18,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial, with_flag
@@ -194,6 +195,16 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
 
 # ------------------------------------------------------------------------------
 # The trials of one condition, each laid on the model by its own release and origin.
+
+
+def within_groups(
+    values: Floats, groups: Sequence[str] | NDArray[np.str_], weight: Floats | float = 1.0
+) -> tuple[Floats, int]:
+    """Deviations from the weighted mean of each group, and their degrees of freedom. Shapes: values (n, …)."""
+    names, group = np.unique(groups, return_inverse=True)
+    shares = np.where(group == np.arange(names.size)[:, None], weight, 0.0)
+    means = (shares / shares.sum(axis=1, keepdims=True)) @ values
+    return np.asarray(values - means[group]), len(group) - names.size
 
 
 @dataclass(frozen=True)
