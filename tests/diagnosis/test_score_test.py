@@ -12,7 +12,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.diagnosis import likelihood_ratio as ratios
 from vinetrack.diagnosis import misfit_tests
-from vinetrack.diagnosis.misfit_tests import MisfitTests, Scores, any_probe_exceeds
+from vinetrack.diagnosis.misfit_tests import MisfitTests, Scores
 from vinetrack.effects import catalogue
 from vinetrack.inference import fit_result, marginal_likelihood
 
@@ -81,6 +81,10 @@ def test_a_size_at_its_bound_takes_nothing_from_an_effect():
     np.testing.assert_allclose(at_bound.plain_sigma, without.plain_sigma, rtol=3e-3)
 
 
+def any_probe_exceeds(of: Scores, level: float) -> bool:
+    return questioned(of, level, ["probe"] * of.score.size).any_exceeds(level)
+
+
 @pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
 def test_probes_of_nothing_are_heard_as_seldom_as_they_say(trials, probes, scatter):
     draw = np.random.default_rng(20604)
@@ -103,7 +107,8 @@ def test_what_one_of_many_probes_feels_alone_is_heard():
 
 
 def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(monkeypatch):
-    of, answers = scores(np.random.default_rng(20607), 12, 2), SimpleNamespace(shapes=[None])
+    of = scores(np.random.default_rng(20607), 12, 2)
+    answers = questioned(of, effects=["probe"] * 2).products
     shaped = scores(np.random.default_rng(20607), 12, 2, sizes=9.0)
     for name in ("_probe_shapes", "products_of"):
         monkeypatch.setattr(misfit_tests, name, lambda *_: answers)

@@ -519,13 +519,6 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     return shapes
 
 
-def any_probe_exceeds(scores: Scores, level: float) -> bool:
-    """Whether the score of some probe exceeds the threshold of so many bumps, of either sign."""
-    signs, names = [0] * scores.score.size, ["probe"] * scores.score.size
-    threshold = family_test(scores.cosines, signs, names, level)["probe"]
-    return bool(np.max(scores.one_sided(signs), initial=0.0) > threshold)
-
-
 # ------------------------------------------------------------------------------
 # Whether trial effects have absorbed what a model lacks.
 #
@@ -684,8 +677,8 @@ class MisfitTests:
     @cached_property
     def probes_reject(self) -> bool:
         """Whether a smooth force would improve the fit."""
-        scores = scores_of(self.fit, products_of(self.fit, _probe_shapes(self.fit)))
-        return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
+        products, level = products_of(self.fit, _probe_shapes(self.fit)), min(PROBE_LEVEL, self.level)
+        return MisfitTests(self.fit, (), products, scores_of(self.fit, products), level).any_exceeds(level)
 
     @cached_property
     def predicted_gains(self) -> Floats:
