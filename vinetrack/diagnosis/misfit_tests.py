@@ -560,7 +560,10 @@ def _by_conditions(fit: Fit) -> list[tuple[float, bool]]:
     # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
     pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
     groups = [trial.trial.condition for trial in fit.trials]
-    fitted, (pressure_sd, damping_sd) = sum(not math.isfinite(number.bound) for number in fit.numbers), fit.state.spread
+    # Parameters with a prior, such as P_y, hardly adapt to the differences between conditions.
+    at_bound = np.isfinite([number.bound for number in fit.numbers])
+    fitted = int(np.count_nonzero((fit.predictor.layout.prior_precision == 0) & ~at_bound))
+    pressure_sd, damping_sd = fit.state.spread
     p_values = (
         _anova_p(np.array([trial.pressure_deviation for trial in fit.trials]), groups, fitted, pressure),
         _anova_p(np.log1p([trial.damping_deviation for trial in fit.trials]), groups, fitted, CAREFUL_DAMPING_SCATTER),
