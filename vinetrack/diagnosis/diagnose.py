@@ -37,7 +37,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.selection import SelectionStep, contradictions, select_effects
+from vinetrack.diagnosis.selection import Report, SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -51,12 +51,6 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import Limits
 
-Report = Callable[[str], None]
-
-
-def _quiet(_: str) -> None:
-    pass
-
 
 @in_one_blas_thread
 def diagnose(
@@ -69,7 +63,7 @@ def diagnose(
     limits: Limits | None = None,
     ladder: bool = True,
     advice: bool = True,
-    report: Report = _quiet,
+    report: Report = lambda _: None,
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -454,8 +453,8 @@ class ForceEquations:
         pushes = [columns @ sizes for columns, sizes in zip(self.accelerations, by_all, strict=True)]
         dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
         motions = [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
-        force = partial(lambda of_all, motion: self.unit_push(motion) @ of_all, coefficients)
-        return self.problem.point(theta, point.trial_effects + effects, motions, force)
+        effects += point.trial_effects
+        return self.problem.point(theta, effects, motions, lambda motion: self.unit_push(motion) @ coefficients)
 
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
