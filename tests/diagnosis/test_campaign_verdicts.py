@@ -25,11 +25,10 @@ import vinetrack as vt
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.units import with_error
-from vinetrack.diagnosis import result, score_test
+from vinetrack.diagnosis import misfit_tests, result
 from vinetrack.diagnosis.force_inversion import ForceEstimate
-from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
-from vinetrack.diagnosis.missing_force import RankedLaw
+from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.replicates import with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
@@ -104,10 +103,10 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
     # What one vine answers alone adds up to what all answer.
     fit = said.fits[0]
     vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
-    asked = score_test.products_of(fit, score_test.shapes_of(FILM, [trial.trial for trial in fit.trials]))
-    assert [shape.group for shape in asked.shapes] == ["", *vines]
-    for trial, columns in zip(fit.trials, asked.columns, strict=True):
-        columns = columns[:, -asked.n_shapes :]
+    responses, _ = misfit_tests._sensitivities(fit, misfit_tests.shapes_of(FILM, [trial.trial for trial in fit.trials]))
+    assert [shape.group for shape, _ in responses] == ["", *vines]
+    for i, trial in enumerate(fit.trials):
+        columns = np.column_stack([moved[i] for _, moved in responses])
         alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
         assert np.any(alone.pop(trial.trial.vine))
         assert not any(np.any(of_other) for of_other in alone.values())
@@ -115,13 +114,13 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
 
 
 def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_has_one():
-    assert [shape.group for shape in score_test.shapes_of(FILM)] == [""]
+    assert [shape.group for shape in misfit_tests.shapes_of(FILM)] == [""]
     told = [("", ()), ("a", ("b",)), ("b", ("a",))]
-    assert [(one.group, one.other_groups) for one in score_test.shapes_of(FILM, TRIALS)] == told
-    assert not any(shape.group for shape in score_test.shapes_of(catalogue()["air_drag"], TRIALS))
+    assert [(one.group, one.other_groups) for one in misfit_tests.shapes_of(FILM, TRIALS)] == told
+    assert not any(shape.group for shape in misfit_tests.shapes_of(catalogue()["air_drag"], TRIALS))
     known = [replace(trial, day=str(1 + k % 2)) for k, trial in enumerate(TRIALS)]
     for of, days in ((known, ["day 1", "day 2"]), ([known[0], replace(known[1], day="")], []), (known[:1], [])):
-        assert [shape.group for shape in score_test.shapes_of(catalogue()["time_base"], of)] == ["", *days]
+        assert [shape.group for shape in misfit_tests.shapes_of(catalogue()["time_base"], of)] == ["", *days]
         assert groups_of(of, "day") == (days or [""] * len(of))
     assert group_names([replace(known[0], day=day) for day in ("10", "2", "2")], "day") == ["day 2", "day 10"]
 
@@ -218,18 +217,18 @@ def test_a_slip_in_a_column_is_named(tmp_path, column, factor, named, size):
 
 
 def test_what_is_left_beside_a_slip_must_be_an_ordinary_error_and_that_is_no_slip():
-    most = score_test.RANGE_SHARE_BESIDE_SLIP * DIAMETER.plausible[1]
+    most = misfit_tests.RANGE_SHARE_BESIDE_SLIP * DIAMETER.plausible[1]
     inside, outside = ((1 + part * most) * (1 + FLAT) - 1 for part in (0.9, 1.2))
-    assert score_test.slip_of(DIAMETER, inside, 0.0) == DIAMETER.slips[0]
-    assert score_test.is_plausible(DIAMETER, inside, 0.0)
-    assert score_test.slip_of(DIAMETER, outside, 0.0) is None
-    assert not score_test.is_plausible(DIAMETER, outside, 0.0)
-    assert score_test.slip_of(DIAMETER, outside, 0.01) is not None
+    assert misfit_tests.slip_of(DIAMETER, inside, 0.0) == DIAMETER.slips[0]
+    assert misfit_tests.is_plausible(DIAMETER, inside, 0.0)
+    assert misfit_tests.slip_of(DIAMETER, outside, 0.0) is None
+    assert not misfit_tests.is_plausible(DIAMETER, outside, 0.0)
+    assert misfit_tests.slip_of(DIAMETER, outside, 0.01) is not None
     # But film a fifth too light is polyethylene sooner than too thin: film is sold to within a tenth.
     for name, part in (("area_scale", 1.0), ("length_scale", 1.0), ("time_base", 1.0), ("film_mass", 0.5)):
         parameter = catalogue()[name].parameters[0]
         assert parameter.slips
-        assert all(score_test.slip_of(parameter, part * error, 0.01) is None for error in (*parameter.plausible, 0.0))
+        assert all(misfit_tests.slip_of(parameter, part * error, 0.01) is None for error in (*parameter.plausible, 0.0))
 
 
 @pytest.mark.slow

@@ -10,10 +10,10 @@ from scipy.stats import chi2, norm
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark
-from vinetrack.diagnosis import result, score_test, selection
+from vinetrack.diagnosis import result, selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
-from vinetrack.diagnosis.selection import EffectSets
+from vinetrack.diagnosis.selection import Search
 from vinetrack.effects import find_effect
 
 NAMES = ("air_drag", "leak", "tail_friction")
@@ -21,15 +21,19 @@ TRIPLE = -1000.0
 
 
 def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> LikelihoodRatio:
-    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers, trials=NAMES)
+    known = {"numbers": numbers, "trials": NAMES, "predictor": SimpleNamespace(data=())}
+    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), **known)
     return LikelihoodRatio(tuple(map(find_effect, names)), fit, 0.0, 0.0, True, Remark(), inflation=inflation)
 
 
-def sets_of(known: list[LikelihoodRatio], thresholds=None) -> EffectSets:
-    family = score_test.FamilyTest(3.9, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
+def sets_of(known: list[LikelihoodRatio], thresholds=None) -> Search:
+    family = dict.fromkeys(NAMES, 4.0) | dict(thresholds or {})
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
-    search = SimpleNamespace(tests=tests, tests_after=lambda _fit: after, report=lambda _line: None)
-    return EffectSets(search, known)
+    search = Search(tests, lambda _line: None)
+    search.tests_after = lambda _fit: after
+    for hypothesis in known:
+        search._keep_best(hypothesis)
+    return search
 
 
 def pairs(worth: float) -> list[LikelihoodRatio]:
@@ -38,14 +42,14 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
     return [of([name for name in NAMES if name != out], TRIPLE - fall**2 / 2) for out, fall in falls]
 
 
-def worth_of_the_last(triple: LikelihoodRatio, sets: EffectSets) -> float:
+def worth_of_the_last(triple: LikelihoodRatio, sets: Search) -> float:
     return selection._worth(triple, sets.subset(triple, triple.effects[:2], again=True), triple.effects[2:])
 
 
 @pytest.fixture(autouse=True)
 def no_refit_succeeds(monkeypatch):
     """Likelihoods and scatter are given; some tests replace this, and campaigns, made once, come before it."""
-    monkeypatch.setattr(EffectSets, "_refit", lambda *_: None)
+    monkeypatch.setattr(Search, "_refit", lambda *_: None)
     monkeypatch.setattr(selection, "robust_ratio", lambda *_: 1.0)
 
 
@@ -110,11 +114,11 @@ def test_significance_is_that_of_the_tail_however_far_out(delta_chi2, degrees):
 def refits_end_at(monkeypatch: pytest.MonkeyPatch, found) -> None:
     """Refits have these likelihoods, that of the triple less 450 where none is given."""
 
-    def refit(sets: EffectSets, _fit, effects) -> None:
+    def refit(sets: Search, _fit, effects) -> None:
         names = tuple(effect.name for effect in effects)
         sets._keep_best(of(names, found.get(frozenset(names), TRIPLE - 450.0)))
 
-    monkeypatch.setattr(EffectSets, "_refit", refit)
+    monkeypatch.setattr(Search, "_refit", refit)
 
 
 @pytest.mark.parametrize(("refit", "needed"), [(TRIPLE - 450.0, True), (TRIPLE - 2.0, False)])
@@ -170,15 +174,14 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
     singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
     pair = SimpleNamespace(names=("latch_release", "lens"), effects=(latch, lens), delta_chi2=1000.0, fit=None)
     after = SimpleNamespace(fit=None)
-    known = {"fitted": dict(enumerate(singles)), "search": SimpleNamespace(tests_after=lambda _: after)}
-    sets = SimpleNamespace(subset=lambda *_: None, **known)
+    search = SimpleNamespace(tests=after, subset=lambda *_: None, tests_after=lambda _: after)
 
     def ratio(_before, effects, fit):
         return SimpleNamespace(names=tuple(effect.name for effect in effects), effects=tuple(effects), fit=fit)
 
     monkeypatch.setattr(selection, "likelihood_ratio", ratio)
     monkeypatch.setattr(selection, "SelectionStep", lambda verdict, *parts, **_: (verdict, *parts[4]))
-    assert selection._rounds(after, sets, [pair], {}, after) == named  # type: ignore[arg-type]
+    assert selection._rounds(search, singles, [pair], {}, after) == named  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

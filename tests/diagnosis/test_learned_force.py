@@ -13,7 +13,6 @@ from scipy.stats import multivariate_normal
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import force_inversion as inversion
-from vinetrack.diagnosis import force_laws as laws
 from vinetrack.diagnosis import missing_force as learning
 from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_text
@@ -255,17 +254,17 @@ PEAKS = {"position": 0.5, "position_squared": 0.25, "speed_squared": 81.0, "spee
 SCALES = {"falling_with_speed": 1.5, "fading_in_time": 0.04, "fading_along": 0.07}
 BEYOND = {"beyond_a_place": (0.06, 0.1), "beyond_a_speed": (1.2, 7.8), "squared_beyond_a_speed": (1.2, 61.0)}
 LAWS = [
-    *(laws.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
-    *(laws.Law(name, (scale,)) for name, scale in SCALES.items()),
-    *(laws.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
-    laws.Law("speed", peak=9.0, reference_area_m2=3e-4),
-    laws.Law("inverse_speed", (2.5,), peak=1.7),
-    laws.Law("patch", (0.08, 0.03)),
-    laws.Law("position", factor="speed", peak=4.0),
-    laws.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
-    laws.Law("falling_with_speed", (1.5,), "position"),
-    laws.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    laws.Law("periodic", (0.03, 0.0)),
+    *(learning.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
+    *(learning.Law(name, (scale,)) for name, scale in SCALES.items()),
+    *(learning.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
+    learning.Law("speed", peak=9.0, reference_area_m2=3e-4),
+    learning.Law("inverse_speed", (2.5,), peak=1.7),
+    learning.Law("patch", (0.08, 0.03)),
+    learning.Law("position", factor="speed", peak=4.0),
+    learning.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
+    learning.Law("falling_with_speed", (1.5,), "position"),
+    learning.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
+    learning.Law("periodic", (0.03, 0.0)),
 ]
 
 

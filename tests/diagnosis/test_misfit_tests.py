@@ -16,7 +16,6 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.diagnosis import ladder, likelihood_ratio, selection
 from vinetrack.diagnosis import misfit_tests as questions
-from vinetrack.diagnosis import score_test as score_test
 from vinetrack.diagnosis.selection import slack_fit
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
@@ -38,7 +37,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
 def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST):
     candidates = ladder.candidates_of(model, None, None)
     found = vt.fit(model, pairs, host=ladder.host_for(model, candidates), profile=False)
-    return questions.misfit_tests(found, score_test.testable(candidates, found.predictor.data)[0], level)
+    return questions.misfit_tests(found, questions.testable(candidates, found.predictor.data)[0], level)
 
 
 def misweighed() -> Pairs:
@@ -63,7 +62,7 @@ def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(mak
 
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model
-    monkeypatch.setattr(score_test, "systematics_of", none)
+    monkeypatch.setattr(questions, "systematics_of", none)
     assert questions.misfit_tests(asked.fit, asked.effects, FIRST).rejects_model
 
 

@@ -66,12 +66,12 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
 
 
 def test_detectable_sizes_follow_the_normal_distribution_and_small_effects_linear_theory(six, power):
-    assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold  # without noise there is no alarm
+    assert six.one_sided_z.max() < 0.3 * six.family[""]  # without noise there is no alarm
     # Fewer trials than a scatter can be told from: only the noise model decides.
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
     entry = power["tail_friction"]
     assert (entry.size_at(0.9) - entry.size_at(0.5)) / sigma == pytest.approx(norm.ppf(0.9), abs=0.06)
-    assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
+    assert entry.size_at(0.5) / sigma >= six.family["tail_friction"] - 0.1
     assert power["leak"].is_visible
     assert not power["air_drag"].is_visible
     k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)

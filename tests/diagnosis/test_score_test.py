@@ -11,9 +11,8 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.diagnosis import likelihood_ratio as ratios
-from vinetrack.diagnosis import misfit_tests, score_test
-from vinetrack.diagnosis.misfit_tests import MisfitTests, any_probe_exceeds
-from vinetrack.diagnosis.score_test import Scores
+from vinetrack.diagnosis import misfit_tests
+from vinetrack.diagnosis.misfit_tests import MisfitTests, Scores
 from vinetrack.effects import catalogue
 from vinetrack.inference import fit_result, marginal_likelihood
 
@@ -82,6 +81,10 @@ def test_a_size_at_its_bound_takes_nothing_from_an_effect():
     np.testing.assert_allclose(at_bound.plain_sigma, without.plain_sigma, rtol=3e-3)
 
 
+def any_probe_exceeds(of: Scores, level: float) -> bool:
+    return questioned(of, level, ["probe"] * of.score.size).any_exceeds(level)
+
+
 @pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
 def test_probes_of_nothing_are_heard_as_seldom_as_they_say(trials, probes, scatter):
     draw = np.random.default_rng(20604)
@@ -104,7 +107,8 @@ def test_what_one_of_many_probes_feels_alone_is_heard():
 
 
 def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(monkeypatch):
-    of, answers = scores(np.random.default_rng(20607), 12, 2), SimpleNamespace(shapes=[None])
+    of = scores(np.random.default_rng(20607), 12, 2)
+    answers = questioned(of, effects=["probe"] * 2).products
     shaped = scores(np.random.default_rng(20607), 12, 2, sizes=9.0)
     for name in ("_probe_shapes", "products_of"):
         monkeypatch.setattr(misfit_tests, name, lambda *_: answers)
@@ -150,7 +154,7 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit = vt.effects.tail_friction, 0.05, 300.0
-    answers = score_test.Products((), (), None, 1, (score_test.CandidateShape(friction, (), 1e-3),))
+    answers = misfit_tests.Products(None, None, (misfit_tests.CandidateShape(friction, (), 1e-3),))
     held = []
     for _ in range(2000):
         one = scores(draw, trials, 1, sizes=true * unit)
@@ -162,17 +166,16 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     assert 0.92 < np.mean(held) < 0.99
 
 
-def test_systematic_errors_that_imitate_a_shape_are_integrated_out(monkeypatch):
+def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     columns = np.random.default_rng(20609).standard_normal((12, 40, 6))  # two errors, the residual, three shapes
     blocks = np.swapaxes(columns, 1, 2) @ columns
     places = np.tile([0, 1], (12, 1))
-    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda *_: blocks)
     arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
     problem = SimpleNamespace(index=places, places_of_pairs=np.tile([0, 1, 2, 4, 5, 6, 8, 9, 10], 12), **arrays)
-    products = SimpleNamespace(problem=problem, n_unknowns=2, n_shapes=3)
+    products = SimpleNamespace(problem=problem, n_unknowns=2, without_trial_effects=lambda _: blocks)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
-    found = score_test.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)
+    found = misfit_tests.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)
     total = blocks.sum(axis=0)
     A, B, C, inner = total[3:, 3:], total[3:, :2], total[:2, :2], np.linalg.inv(total[:2, :2] + np.eye(2))
     assert np.linalg.eigvalsh(C).min() > 1
@@ -240,8 +243,8 @@ SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
     ids=["of either sign", "of one sign", "equal shares", "the same curve counts once", "the silent take no share"],
 )
 def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
-    family = score_test.family_test(cosines, [sign] * len(names), list(names), level)
-    assert family.threshold("a") == pytest.approx(norm.isf(share), abs=0.01)
+    family = misfit_tests.family_test(cosines, [sign] * len(names), list(names), level)
+    assert family["a"] == pytest.approx(norm.isf(share), abs=0.01)
 
 
 @pytest.mark.slow
@@ -250,8 +253,8 @@ def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_
     draw, level = np.random.default_rng(20620), 3e-3
     own = draw.standard_normal((len(SIZES), 40))[np.repeat(range(len(SIZES)), SIZES)]
     cosines = np.corrcoef(own + draw.standard_normal((len(NAMES), 40)))
-    family = score_test.family_test(cosines, SIGNS, NAMES, level)
-    limits, signs = np.array([family.threshold(name) for name in NAMES]), np.array(SIGNS)
+    family = misfit_tests.family_test(cosines, SIGNS, NAMES, level)
+    limits, signs = np.array([family[name] for name in NAMES]), np.array(SIGNS)
     draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
     alarms, total, by_many = 0, 0, 0  # by_many: by the candidate of thirty shapes
     for _ in range(40):
@@ -261,7 +264,7 @@ def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_
         by_many += int(beyond[:, [name == "effect_12" for name in NAMES]].any(axis=1).sum())
     assert 0.6 * level < alarms / total < 1.1 * level
     assert 0.5 < by_many / total / (level / len(set(NAMES))) < 2.0
-    assert family.threshold("effect_12") > family.threshold("effect_1") + 0.4
+    assert family["effect_12"] > family["effect_1"] + 0.4
 
 
 def test_an_implausible_size_is_believed_where_no_other_is_plausible():
@@ -275,5 +278,5 @@ def test_an_implausible_size_is_believed_where_no_other_is_plausible():
 def test_any_phase_of_a_swing_is_plausible():
     """A phase of −3.67 rad is one of 2.61."""
     of = {parameter.name: parameter for parameter in catalogue()["supply_pulsation"].parameters}
-    assert all(score_test.is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))
-    assert not score_test.is_plausible(of["f"], 480.0, 0.0)
+    assert all(misfit_tests.is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))
+    assert not misfit_tests.is_plausible(of["f"], 480.0, 0.0)

@@ -11,7 +11,7 @@ from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
-from vinetrack.diagnosis.force_laws import FORMS
+from vinetrack.diagnosis.missing_force import FORMS
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
 from vinetrack.narrative import templates

@@ -24,6 +24,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, full_fit, likelihood_ratio
+from vinetrack.diagnosis.replicates import within_groups
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
@@ -200,22 +201,13 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     mean square within conditions over that within vines, 1 on average for trials in random order. Without replicates
     they are always confounded. Shapes: regressors (n_trials, k).
     """
-    in_conditions, inner_degrees = _square_within(regressors, [trial.condition for trial in trials])
-    in_vines, outer_degrees = _square_within(regressors, [trial.vine for trial in trials])
-    if inner_degrees == 0 or in_vines == 0:
+    in_conditions, inner_degrees = within_groups(regressors, [trial.condition for trial in trials])
+    in_vines, outer_degrees = within_groups(regressors, [trial.vine for trial in trials])
+    if inner_degrees == 0 or np.allclose(in_vines, 0.0):
         return True
     # 0.5: A difference is confounded with the conditions if its variance within conditions is below this fraction
     # of that in random order (1 on average) (chosen)
-    return in_conditions / inner_degrees < 0.5 * in_vines / max(outer_degrees, 1)
-
-
-def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
-    """Sum of squares about the group means, and its degrees of freedom."""
-    total, names = 0.0, sorted(set(groups))
-    for name in names:
-        member = values[np.array([group == name for group in groups])]
-        total += float(np.sum((member - member.mean(axis=0)) ** 2))
-    return total, len(groups) - len(names)
+    return bool(np.sum(in_conditions**2) / inner_degrees < 0.5 * np.sum(in_vines**2) / max(outer_degrees, 1))
 
 
 # Hypotheses that trials differ, by their names in an answer set; standard deviations are chosen

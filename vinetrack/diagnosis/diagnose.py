@@ -20,7 +20,7 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.misfit_tests import LARGEST_MISSED
+from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
 from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -37,8 +37,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.score_test import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
-from vinetrack.diagnosis.selection import SelectionStep, contradictions, select_effects
+from vinetrack.diagnosis.selection import Report, SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -52,12 +51,6 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import Limits
 
-Report = Callable[[str], None]
-
-
-def _quiet(_: str) -> None:
-    pass
-
 
 @in_one_blas_thread
 def diagnose(
@@ -70,7 +63,7 @@ def diagnose(
     limits: Limits | None = None,
     ladder: bool = True,
     advice: bool = True,
-    report: Report = _quiet,
+    report: Report = lambda _: None,
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
@@ -238,7 +231,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         z = tests.best_z(effect.name)
         if effect.name in tests.products.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
-        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
+        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family[effect.name]:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
         else:
             # An effect that contains one of the answer set can fit no worse, and need not be fitted.

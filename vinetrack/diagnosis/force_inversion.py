@@ -16,27 +16,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials, replicate_scatter, residual_courses
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, root_of_covariance, splines, whiten
+from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, products, root_of_covariance, splines
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
+    FitState,
+    at_prior_means,
     eliminated,
     inverse_of_block,
+    summed,
     trial_effect_prior,
+    whitened_products,
 )
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
+from vinetrack.inference.systematics import with_unknowns
 
 # ------------------------------------------------------------------------------
 # Motions, and the sensitivities of their positions to a small added force on the tail.
@@ -320,31 +324,26 @@ class ForceProblem:
     """
 
     def __init__(self, fit: Fit) -> None:
-        self.fit, self.data = fit, fit.predictor.data
-        self.scatter = replicate_scatter(fit, residual_courses(align_trials(fit)))
-        self.prior = fit.solution.problem
-        self.rho = track_correlation(self.data)
-        noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - self.rho**2)
-        self.variance = np.maximum(noise, variance_floor(self.data))
+        self.fit, self.data, self.prior = fit, fit.predictor.data, fit.solution.problem
+        self.scatter = align_trials(fit).scatter
+        rho = track_correlation(self.data)
+        noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - rho**2)
         least, scatter = LEAST_BETWEEN_TRIAL_SD, self.scatter
         spread = (max(scatter.pressure, least[0]), max(scatter.damping, least[1]))
-        state = replace(fit.solution.state, spread=spread)
-        self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
-        # A parameter without prior and information stays where it is.
-        self.precision = np.maximum(self.prior.prior_precision, 1e-12)
+        effects = np.zeros((len(self.data), N_TRIAL_EFFECTS))
+        effects[:, [RELEASE, ORIGIN]] = self.prior.release_origin_mean
+        variance = np.maximum(noise, variance_floor(self.data))
+        self.state = FitState(fit.solution.state.theta, effects, spread, rho, variance)
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
-        effects = np.zeros_like(self.effects_mean)
-        effects[:, :2] = self.effects_mean[:, :2]
+        self.n_independent = 20 * len(self.data)  # Independent residuals where a model leaves more than noise (chosen)
         motions = [_on_track(*each) for each in zip(self.data, effects, motions_of(fit, effects), strict=True)]
-        self.start = self.point(state.theta, effects, motions)
+        self.start = self.point(self.state.theta, effects, motions)
 
     def inflation(self, chi2: float) -> float:
         """Variance in units of the noise's where a model leaves this χ². What it leaves beyond the noise is correlated
         along a trial.
         """
-        # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
-        points_per_part = max(self.n_points / (20 * len(self.data)), 1.0)
-        return 1 + max(chi2 / self.n_points - 1, 0.0) * points_per_part
+        return 1 + max(chi2 / self.n_points - 1, 0.0) * max(self.n_points / self.n_independent, 1.0)
 
     def point(
         self, theta: Floats, trial_effects: Floats, motions: Sequence[FittedMotion], push: Push | None = None
@@ -372,9 +371,10 @@ class ForceProblem:
 
 
 class ForceEquations:
-    """The normal equations of the coefficients of a force about a point, where they have given values (0). `cost` is χ²
-    there with the priors of all other unknowns, `chi2` that with all others estimated anew. `information` (q, q) and
-    `score` (q,) are those of the coefficients with all other unknowns eliminated.
+    """The normal equations of the coefficients of a force about a point, where they have given values (0): unknowns
+    beside the parameters (`joint`). `cost` is χ² there with the priors of all other unknowns, `chi2` that with all
+    others estimated anew. `information` (q, q) and `score` (q,) are those of the coefficients with all other unknowns
+    eliminated.
     """
 
     def __init__(
@@ -393,74 +393,42 @@ class ForceEquations:
             for motion, columns, push in zip(point.motions, point.by_parameters, pushes, strict=True)
         ]  # fmt: skip
         sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
-        rows = [self._rows(i, of_trial) for i, of_trial in enumerate(sensitivities)]
-        self.of_trials, self.of_effects = eliminated(np.array(rows), problem.effects_precision)
-        # Parameters, coefficients, residual; in the last row what no unknown belongs to
-        shared = np.broadcast_to(np.arange(p, p + q + 1), (len(rows), q + 1))
-        self.places = np.hstack([np.where(problem.prior.index < 0, p + q + 1, problem.prior.index), shared])
-        total = np.zeros((p + q + 2, p + q + 2))
-        for places, block in zip(self.places, self.of_trials, strict=True):
-            total[np.ix_(places, places)] += block
-        total = total[:-1, :-1]
-        held = np.flatnonzero(~problem.prior.free)
-        total[held] = total[:, held] = 0.0
-        own = np.diag(total).copy()
-        self.ridge = LEAST_INFORMATION * np.maximum(own[p:-1], max(1e-6 * own[p:-1].max(), 1e-300))
-        from_mean = np.where(problem.prior.free, point.theta - problem.prior.prior_mean, 0.0)
-        total[:p, -1] -= problem.prior.prior_precision * from_mean
-        total[-1, :p] = total[:p, -1]
-        self.cost = float(total[-1, -1] + problem.prior.prior_precision @ from_mean**2)
-        square = total[:p, :p] + np.diag(problem.precision)
-        # 1e-9: share of its information below which what other unknowns leave of a parameter is rounding (derived)
-        determined = np.flatnonzero(np.diag(square) > 1e-9 * np.maximum(own[:p], 1e-300))
-        self.of_parameters = inverse_of_block(square, determined) @ total[:p, p:]
-        reduced = total[p:, p:] - total[p:, :p] @ self.of_parameters
-        self.information, self.score = reduced[:-1, :-1], reduced[:-1, -1]
-        self.chi2 = self.cost - float(total[-1, :p] @ self.of_parameters[:, -1])
+        cross_products = np.stack([self._products(*of_trial) for of_trial in enumerate(sensitivities)])
+        self.joint, theta = with_unknowns(problem.prior, q, 0.0), np.append(point.theta, np.zeros(q))
+        state = replace(problem.state, theta=theta, trial_effects=point.trial_effects)
+        white = at_prior_means(whitened_products(cross_products, state), self.joint, state, -1)
+        blocks, self.of_effects = eliminated(white, trial_effect_prior(self.joint, state)[1])
+        square, slope, self.cost = summed(blocks, self.joint, theta)
+        own = np.diag(square)
+        self.ridge = LEAST_INFORMATION * np.maximum(own[p:], max(1e-6 * own[p:].max(), 1e-300))
+        total = np.column_stack([square, slope])
+        determined = np.flatnonzero(problem.prior.free & (own[:p] > 0))
+        self.of_parameters = inverse_of_block(square[:p, :p], determined) @ total[:p, p:]
+        reduced = total[p:, p:] - square[p:, :p] @ self.of_parameters
+        self.information, self.score = reduced[:, :-1], reduced[:, -1]
+        self.chi2 = self.cost - float(slope[:p] @ self.of_parameters[:, -1])
 
-    def _rows(self, trial: int, sensitivities: Floats) -> Floats:
-        """Products of [trial effects, parameters, coefficients, residual] of a trial, with the prior of its effects."""
-        problem, trial_data = self.problem, self.problem.data[trial]
-        motion, effects = self.point.motions[trial], self.point.trial_effects[trial]
-        since_s = trial_data.time_s - effects[RELEASE]
-        position_m, velocity_m_s = _observed(motion, since_s)
-        residual_m = trial_data.lead_position_m - effects[ORIGIN] - position_m - sensitivities[:, -1]
-        rows = np.column_stack([-velocity_m_s, np.ones_like(since_s), sensitivities[:, :-1], residual_m])
-        length_m = trial_data.trial.length_m
-        ended = np.flatnonzero(trial_data.lead_position_m - effects[ORIGIN] > MOST_OF_LENGTH * length_m)
+    def _products(self, trial: int, sensitivities: Floats) -> Floats:
+        """Cross products of trial effects, parameters, coefficients and residual of a trial."""
+        trial_data, effects = self.problem.data[trial], self.point.trial_effects[trial]
+        position_m, velocity_m_s = _observed(self.point.motions[trial], trial_data.time_s - effects[RELEASE])
+        grown_m = trial_data.lead_position_m - effects[ORIGIN]
+        residual_m = grown_m - position_m - sensitivities[:, -1]
+        columns = np.column_stack([-velocity_m_s, np.ones_like(grown_m), sensitivities[:, :-1], residual_m])
+        ended = np.flatnonzero(grown_m > MOST_OF_LENGTH * trial_data.trial.length_m)
         used = slice(0, int(ended[0]) if ended.size else None)
         relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
-        white = whiten(rows[used], trial_data.first[used], problem.rho, relative_sd)
-        gram, from_mean = white.T @ white / problem.variance[trial], effects - problem.effects_mean[trial]
-        gram[:N_TRIAL_EFFECTS, -1] -= problem.effects_precision[trial] * from_mean
-        gram[-1, :N_TRIAL_EFFECTS] = gram[:N_TRIAL_EFFECTS, -1]
-        gram[-1, -1] += problem.effects_precision[trial] @ from_mean**2
-        return np.asarray(gram)
+        return products(columns[used], trial_data.first[used], relative_sd)
 
     def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
-        """Least squares for some of the coefficients, the others as they are. Standard errors are the larger of those
-        of the noise and those of the scatter between trials (cluster-robust).
-        """
-        information, score, response = self.information[columns, columns], self.score[columns], self.of_parameters
-        of_force = response[:, :-1][:, columns]
+        """Least squares for some of the coefficients, the others as they are; what they leave counts as noise."""
+        information, score = self.information[columns, columns], self.score[columns]
         covariance = np.linalg.inv(information + np.diag(self.ridge[columns]))
-        change = covariance @ score
-        shift = response[:, -1] - of_force @ change
-        # What each trial adds to the score of the coefficients at the estimate
-        index = self.problem.prior.index
-        k, trials = index.shape[1], self.of_trials
-        rows = np.concatenate([trials[:, :k], trials[:, k:-1][:, columns]], axis=1)
-        left = rows[:, :, -1] - rows[:, :, k:-1][:, :, columns] @ change
-        left -= np.einsum("nrk,nk->nr", rows[:, :, :k], np.append(shift, 0.0)[index])
-        by_key = np.vstack([of_force, np.zeros((1, change.size))])[index]
-        scores = left[:, k:] - np.einsum("nkl,nk->nl", by_key, left[:, :k])
-        clusters = len(scores) / max(len(scores) - shift.size - change.size, 1)
-        robust = covariance @ (scores.T @ scores * clusters) @ covariance
-        variance = max(float(np.trace(covariance)), float(np.trace(robust))) / change.size
-        dof = float(np.trace(covariance @ information))
+        change, variance = covariance @ score, float(np.trace(covariance)) / score.size
         if not variance > 0:
             raise np.linalg.LinAlgError("the positions do not determine a force")
-        return ForceEstimate(float(score @ change), change, math.sqrt(variance), dof)
+        fall, dof = float(score @ change), float(np.trace(covariance @ information))
+        return ForceEstimate(fall, change, math.sqrt(variance * self.problem.inflation(self.chi2 - fall)), dof)
 
     def chi2_with(self, coefficients: Floats) -> float:
         """χ² with these coefficients, all other unknowns estimated anew."""
@@ -476,16 +444,17 @@ class ForceEquations:
         change = coefficients - self.coefficients
         theta = point.theta + self.of_parameters[:, -1] - self.of_parameters[:, :-1] @ change
         theta = np.clip(theta, prior.lower, prior.upper)
-        step = np.concatenate([theta - point.theta, change, [0.0, 0.0]])[self.places[:, :-1]]
+        step = np.concatenate([theta - point.theta, change, [0.0]])[self.joint.index]
         effects = self.of_effects[:, :, -1] - np.einsum("nek,nk->ne", self.of_effects[:, :, :-1], step)
+        effects[:, DEVIATION_COLUMNS] -= point.trial_effects[:, DEVIATION_COLUMNS]
         limits_s = np.array([2 * trial_data.frame_s for trial_data in self.problem.data])
         effects[:, RELEASE] = np.clip(effects[:, RELEASE], -limits_s, limits_s)
         by_all = np.column_stack([effects[:, DEVIATION_COLUMNS], step, np.ones(len(effects))])
         pushes = [columns @ sizes for columns, sizes in zip(self.accelerations, by_all, strict=True)]
         dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
         motions = [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
-        force = partial(lambda of_all, motion: self.unit_push(motion) @ of_all, coefficients)
-        return self.problem.point(theta, point.trial_effects + effects, motions, force)
+        effects += point.trial_effects
+        return self.problem.point(theta, effects, motions, lambda motion: self.unit_push(motion) @ coefficients)
 
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:

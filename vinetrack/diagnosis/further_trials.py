@@ -24,9 +24,8 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
-from vinetrack.diagnosis.misfit_tests import MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import Products, products_without_trial_effects
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
@@ -71,10 +70,11 @@ class Designs:
     def __init__(self, fit: Fit, products: Products, n_before: int, wanted: Sequence[int]) -> None:
         problem, self.n_unknowns = products.problem, products.problem.prior_mean.size
         size = self.n_unknowns + len(wanted)
-        residual_and_shapes = np.full(1 + products.n_shapes, -1)
+        blocks = products.without_trial_effects(fit.state)
+        residual_and_shapes = np.full(blocks.shape[-1] - products.n_unknowns, -1)
         residual_and_shapes[1 + np.array(wanted)] = np.arange(self.n_unknowns, size)
         index = np.hstack([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))])
-        of_trials = at_unknowns(products_without_trial_effects(products, fit.state), index, size)
+        of_trials = at_unknowns(blocks, index, size)
         # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
         # (chosen); what is asked about has none
         prior = np.append(np.maximum(problem.prior_precision, 1e-6), np.zeros(len(wanted)))
@@ -208,14 +208,12 @@ def _designs_of(tied: Sequence[Fit], extended: Sequence[Fit]) -> list[Designs]:
     """The forms of each hypothesis once refitted; wanted is by how much trials move if another one is true."""
     count, designs = len(tied[0].trials), []
     for fit in extended:
-        columns = []
+        white = []
         for i, of_fit in enumerate(fit.solution.columns):
-            moved = [of_fit[:, -1] - other.solution.columns[i][:, -1] for other in extended]
-            columns.append(
-                np.column_stack([of_fit, *moved]) if i >= count else np.pad(of_fit, ((0, 0), (0, len(tied))))
-            )
-        products = Products(tuple(columns), fit.predictor.data, fit.solution.problem, len(tied))
-        designs.append(Designs(fit, products, count, range(len(tied))))
+            further = float(i >= count)
+            moved = [further * (of_fit[:, -1] - other.solution.columns[i][:, -1]) for other in extended]
+            white.append(in_noise(fit, i, np.column_stack([of_fit, *moved])))
+        designs.append(Designs(fit, Products(np.stack(white), fit.solution.problem), count, range(len(tied))))
     return designs
 
 

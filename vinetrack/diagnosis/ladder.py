@@ -9,6 +9,7 @@ model improves, but the excess √(rms² − floor²) does.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,12 +28,9 @@ from vinetrack.diagnosis.replicates import (
     AlignedTrials,
     Replicates,
     align_trials,
-    by_condition,
     expected_error,
     first_that_counts,
-    replicate_scatter,
     replicates_by_condition,
-    residual_courses,
 )
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
@@ -152,8 +150,6 @@ def compare(
     import pandas as pd
 
     aligned = align_trials(fit)
-    courses = residual_courses(aligned)
-    scatter, of_condition = replicate_scatter(fit, courses), by_condition(courses)
     measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
     final = _final_speed_errors(aligned, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
@@ -164,7 +160,7 @@ def compare(
                 "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(together),
-                **expected_error(of_condition[condition], scatter),
+                **expected_error(aligned.courses[condition], aligned.scatter),
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
@@ -277,8 +273,8 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
     floor_m = inside[0].floor_m
-    courses = residual_courses(align_trials(fits[0]))
-    expected = expected_error(courses, replicate_scatter(fits[0], courses))
+    aligned = align_trials(fits[0])
+    expected = expected_error(list(itertools.chain(*aligned.courses.values())), aligned.scatter)
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
         rows.append(

@@ -1,23 +1,21 @@
 """Hypotheses: fits of candidate effects, likelihood ratios, the plausibility of sizes, and the answer set.
 
-Candidates are chosen by the gain that the linear model predicts, and fitted to all trials from the shapes of which it
-expects most; sets of them are in `selection`. The answer set holds every hypothesis that the data cannot exclude.
+The answer set holds every hypothesis that the data cannot exclude. Which are fitted is in `selection`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, MutableMapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_LATER_ROUNDS, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import CandidateShape, is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
-from vinetrack.diagnosis.score_test import CandidateShape, is_plausible
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
@@ -228,7 +226,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
 
 # ------------------------------------------------------------------------------
-# Fits of single effects, made once each.
+# Fits of hypotheses.
 
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
@@ -269,31 +267,17 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
 
 
 # ------------------------------------------------------------------------------
-# Memory of a search over hypotheses about many trials: curves of fits that no longer compete are dropped.
+# Memory of a search over hypotheses about many trials: it keeps fits without their curves.
 #
 # The curves of a fit to a thousand trials of 550 frames take some sixty megabytes, its misfit tests 700, and a search
-# makes dozens of fits. Numbers, likelihood and state of a fit always stay; its curves are computed again from them
-# where a later step needs them.
-
-
-Key = TypeVar("Key")
+# makes dozens of fits. Numbers, likelihood and state of a fit stay; its curves are computed again from them where a
+# later step needs them.
 
 
 def is_large(fit: Fit) -> bool:
-    """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole."""
-    # 150_000: points of all trials from which curves are dropped (chosen)
+    """Whether a fit has so many points that the fits of a search cannot be kept whole."""
+    # 150_000: points of all trials from which curves are let go (chosen)
     return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > 150_000
-
-
-def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
-    """Drop the curves of hypotheses that can no longer enter an answer set."""
-    ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
-    # 8: fits, the likeliest of a search, that are kept whole (chosen)
-    for key, hypothesis in ranked[8:]:
-        fit = hypothesis.fit
-        deviance_excess = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
-        if fit.trials and deviance_excess > OUT_OF_REACH and is_large(fit):
-            fitted[key] = replace(hypothesis, fit=without_curves(fit))
 
 
 def without_curves(fit: Fit) -> Fit:
@@ -314,77 +298,3 @@ def with_curves(fit: Fit) -> Fit:
     solution = replace(fit.solution, columns=tuple(columns))
     trials = assemble(former, solution, fit.left_out, fit.options, profile=False).trials
     return replace(fit, trials=trials, solution=solution)
-
-
-Report = Callable[[str], None]  # Called with a few words on what is being done
-
-
-FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
-
-MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
-
-STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
-
-
-@dataclass
-class CandidateFits:
-    """Fits of single effects added to one model, by name, made once each; `failed` are effects whose fits failed."""
-
-    tests: MisfitTests
-    report: Report
-    fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
-    failed: set[str] = field(default_factory=set)
-    tests_by_fit: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
-
-    @property
-    def names(self) -> list[str]:
-        """Effects to which trials respond, the largest predicted gain first."""
-        names = dict.fromkeys(self.tests.products.effects)
-        return sorted(names, key=lambda name: -self.tests.predicted_gain(name))
-
-    def tests_after(self, fit: Fit) -> MisfitTests:
-        """Run the misfit tests of one of the fits, at the level of later rounds."""
-        for tested_fit, tests in self.tests_by_fit:
-            if tested_fit is fit:
-                return tests
-        tests = misfit_tests(with_curves(fit), self.tests.effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
-        if is_large(fit):
-            self.tests_by_fit.clear()
-        self.tests_by_fit.append((fit, tests))
-        return tests
-
-    def fit(self, most: int | None = None, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
-        """Fit candidates of large predicted gain, at `most` so many, or all: a model whose parameters have adapted to
-        the lack of an effect may predict no gain for it, not even the right sign.
-        """
-        for name in self.names if all_of_them else self._promising[:most]:
-            if name not in self.fitted and name not in self.failed:
-                self._fit_from_prediction(name)
-        return list(self.fitted.values())
-
-    @property
-    def _promising(self) -> list[str]:
-        """Effects of a large part of the largest predicted gain, the largest first."""
-        gains = {name: self.tests.predicted_gain(name) for name in self.names}
-        return [name for name in gains if gains[name] > MIN_SHARE_OF_BEST_PREDICTION * max(gains.values())]
-
-    def _fit_from_prediction(self, name: str) -> None:
-        """Fit an effect from its shapes of largest predicted gain, until one gains what is predicted."""
-        self.report(f"fitting {name}")
-        for index in self.tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
-            shape, size = self.tests.products.shapes[index], float(self.tests.scores.size[index])
-            # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
-            credible = [known for known in self.fitted.values() if known.plausible and known.credible]
-            best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
-            model = self.tests.fit.model.with_effects((shape.effect,))
-            near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
-            fit = full_fit(self.tests.fit, model, start=start_values(shape, size), best=best, once=near)
-            hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, (shape.effect,), fit)
-            if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:
-                self.failed.add(name)
-            elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
-                self.fitted[name] = hypothesis
-                drop_curves(self.fitted)
-            # 0.7: share of its predicted gain that a fit must reach for no other shape to be tried (chosen)
-            if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.tests.predicted_gain(name):
-                break

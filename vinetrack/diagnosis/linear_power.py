@@ -30,19 +30,17 @@ from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     PROBE_LEVEL,
+    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     misfit_tests,
-)
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
-from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.diagnosis.score_test import (
-    CandidateShape,
     plausible_range,
     products_of,
     scores_of,
     testable,
 )
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
+from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.effects import Effect, EffectError
@@ -76,41 +74,36 @@ def noiseless_start(fit: Fit) -> Fit:
 
 
 def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) -> tuple[Floats, Floats]:
-    """Sizes of an effect, and the ratios of its expected scores there to those of linear theory. Where the score at
-    seven units, above any threshold, agrees with linear theory, no other size is computed. Shape (n_sizes,) each.
+    """Sizes of an effect and the ratios of its expected scores there to those of linear theory, up to a score above any
+    threshold. Shape (n_sizes,) each.
     """
-    largest = 2.0  # Ratio of an expected score to that of linear theory from which neither is used (chosen)
-    multiples, ratios = [7.0], [score_ratio(tests, shape_index, 7.0 * unit, start)]
-    # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
-    if not 0 < abs(ratios[0] - 1) < 0.02:
-        multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4.0 * unit, start), *ratios]
-        if not all(0 < ratio < largest for ratio in ratios):
-            return unit * np.array(multiples), np.ones(2)
-        # 7.0: expected score from which no larger size is tried (chosen)
-        # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
-        while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
-            ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
-            if ratio == 1 or not 0 < ratio < largest:
-                break
-            multiples.append(2 * multiples[-1])
-            ratios.append(ratio)
-    return unit * np.array(multiples), np.array(ratios)
+    multiples, ratios = list[float](), list[float]()
+    # (4.0, …): multiples of the size of one standard error at which the score is computed (chosen)
+    for multiple in (4.0, 7.0, 14.0, 28.0, 56.0):
+        ratio = score_ratio(tests, shape_index, multiple * unit, start)
+        # 2.0: ratio of an expected score to that of linear theory from which neither is used (chosen)
+        if not 0 < ratio < 2.0:
+            break
+        multiples.append(multiple)
+        ratios.append(ratio)
+        # 6.5: expected score from which no larger size is tried (chosen)
+        if ratio * multiple > 6.5:
+            break
+    return unit * np.array(multiples or [7.0]), np.array(ratios or [1.0])
 
 
 def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -> float:
-    """Expected score of an effect at a size, divided by that of linear theory. Returns 1 where the trajectories with
-    the effect cannot be simulated, or the fit without it does not converge.
+    """Expected score of an effect at a size, divided by that of linear theory. NaN where the trajectories with the
+    effect cannot be simulated, or the fit without it does not converge.
     """
     shape, sigma = tests.products.shapes[shape_index], float(tests.scores.plain_sigma[shape_index])
     try:
         refit = fitted_without(start, shape, size)
-        if not refit.solution.converged:
-            return 1.0
         scores = scores_of(refit, products_of(refit, [shape]))
-        if not scores.score.size:
-            return 1.0
     except (SimulationError, np.linalg.LinAlgError):
-        return 1.0
+        return math.nan
+    if not refit.solution.converged or not scores.score.size:
+        return math.nan
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
@@ -253,11 +246,12 @@ def _effect_power(
     if not means[-1] > 0:
         return None
     needed = np.quantile(_required_means(tests, index, inflation[:, index]), PROBABILITIES)
-    # The sizes at which the score has these means: proportional below the first size and beyond the last
-    between = np.interp(needed, [0.0, *means], [0.0, *sizes])
-    steps = np.where(needed >= means[-1], sizes[-1] * needed / means[-1], between)
-    at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
-    taken_for = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
+    # The sizes at which the score has these means, and the expected scores of all shapes at that of 90 %
+    steps = _along(needed, means, sizes)
+    at_90, taken_for = steps[PROBABILITIES.index(0.9)], dict[str, float]()
+    if math.isfinite(at_90):
+        there = np.array([_along(np.abs(at_90), np.abs(sizes), of_shape) for of_shape in scores.T])
+        taken_for = _confusion(tests, effect, there, null_scores)
     zero, of_size = 0.0, {"parameter": "", "symbol": "size", "unit": "1"}
     if effect.parameters:
         size = shape.size
@@ -275,14 +269,9 @@ def _effect_power(
     )
 
 
-def _scores_at(sizes: Floats, scores: Floats, size: float) -> Floats:
-    """Expected scores of all shapes at a size: interpolated, and proportional beyond the last; NaN for no size."""
-    if not math.isfinite(size):
-        return np.full(scores.shape[1], math.nan)
-    away = np.concatenate([[0.0], np.abs(sizes)])
-    if size > away[-1]:
-        return np.asarray(scores[-1] * size / away[-1])
-    return np.array([np.interp(size, away, [0.0, *column]) for column in scores.T])
+def _along(at: Floats, x: Floats, y: Floats) -> Floats:
+    """A curve from 0 through these points, straight between them, proportional beyond the last. Shapes: x, y (n,)."""
+    return np.asarray(np.where(at >= x[-1], y[-1] * at / x[-1], np.interp(at, [0.0, *x], [0.0, *y])))
 
 
 def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats:
@@ -290,7 +279,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     model, and that of Student's t with the standard error found from the scatter of single trials.
     """
     scores = tests.scores
-    limit = tests.family.threshold(tests.products.effects[index])
+    limit = tests.family[tests.products.effects[index]]
     passes = SCORE_GRID / inflation >= limit
     threshold = float(SCORE_GRID[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
@@ -319,7 +308,8 @@ def error_inflation(tests: MisfitTests) -> Floats:
     estimated, or from hundreds of trials. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
-    if len(tests.products.parts) > 1:
+    # 256: trials from which what the fit takes for scatter is not computed: it is little, and takes long (chosen)
+    if len(fit.trials) > 256:
         return np.ones((SCORE_GRID.size, len(scores.score)))
     # Factors on the between-trial standard deviations at which the information is computed (chosen)
     factors = [(1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0) if free else (1.0,) for free in estimable(fit.solution.problem)]
@@ -339,8 +329,6 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     candidate exceeds its threshold. A score counts where its size is credible, see `likelihood_ratio`; an effect that
     contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
     """
-    if np.isnan(mean).any():
-        return {}
     drawn, effects = null_scores + mean, np.array(tests.products.effects)
     far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.products.shapes]
     with np.errstate(invalid="ignore"):
@@ -348,7 +336,7 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     counted = np.maximum(np.where(credible, _sided(drawn, tests.signs), 0.0), 0.0) ** 2
     names = list(dict.fromkeys(tests.products.effects))
     squares = np.stack([counted[:, effects == name].max(axis=1) for name in names], axis=1)
-    limits = np.array([tests.family.threshold(name) for name in names])
+    limits = np.array([tests.family[name] for name in names])
     alarm = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(alarm) < DRAWS / 100:
         return {}

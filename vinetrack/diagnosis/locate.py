@@ -8,9 +8,10 @@ thousand frames of one trial are one trial.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,12 +28,10 @@ from vinetrack.diagnosis.replicates import (
     Scatter,
     Stretches,
     align_trials,
-    by_condition,
     common_stretches,
     orthogonal_part,
-    replicate_scatter,
     replicates_by_condition,
-    residual_courses,
+    within_groups,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
@@ -92,13 +91,12 @@ def locate(fit: Fit) -> Failure:
     import pandas as pd
 
     aligned = align_trials(fit)
-    courses = residual_courses(aligned)
-    scatter, together = replicate_scatter(fit, courses), replicates_by_condition(aligned.trials)
-    rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in by_condition(courses).items()]
+    courses, together = aligned.courses, replicates_by_condition(aligned.trials)
+    rows = [_condition_row(together[name], common_stretches(courses[name]), aligned.scatter) for name in courses]
     return Failure(
         pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_position=_residual_along_growth(courses, scatter),
+        along_position=_residual_along_growth(courses, aligned.scatter),
         drift=drift(fit, aligned),
     )
 
@@ -139,16 +137,17 @@ def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter)
     }
 
 
-def _residual_along_growth(courses: Sequence[ResidualCourse], scatter: Scatter) -> pd.DataFrame:
+def _residual_along_growth(courses: Mapping[str, Sequence[ResidualCourse]], scatter: Scatter) -> pd.DataFrame:
     """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
     its standard error.
     """
     import pandas as pd
 
     rows: list[tuple[object, ...]] = []
-    for condition, members in by_condition(courses).items():
+    for condition, members in courses.items():
         vine = members[0].trial.vine
-        reach_m = max(float(course.lead_position_m.max()) for course in courses if course.trial.vine == vine)
+        of_vine = [course for course in itertools.chain(*courses.values()) if course.trial.vine == vine]
+        reach_m = max(float(course.lead_position_m.max()) for course in of_vine)
         edges = np.linspace(0.0, reach_m, MAX_STRETCHES + 1)
         in_stretches = [member.means("lead_position_m", edges) for member in members]
         means_m = np.array([means for means, _ in in_stretches])
@@ -190,7 +189,7 @@ COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
 
 DRIFT_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
-    *("z", "z_constancy", "dof", "n_trials", "significant", "sentence"),
+    *("z", "dof", "n_trials", "significant", "sentence"),
 )
 GROUP_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
@@ -256,23 +255,20 @@ def _tested(
     subject: Row,
     levels: tuple[float, float],
     change: tuple[float, float],
-    p: tuple[float, ...],
+    p: float,
     dof: float,
     n_trials: int,
     groups: Sequence[Row] = (),
     **told: Any,
 ) -> Row:
     """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
-    its standard error. `p` are the p-values of a steady change and, where it is asked, of any; `told` is what the
-    sentence about it needs besides.
+    its standard error. `told` is what the sentence about it needs besides.
     """
     from scipy.stats import norm
 
-    z, z_constancy = (float(norm.isf(max(each, 1e-300) / 2)) for each in (p[0], p[-1]))
-    numbers = (*levels, *change, z, z_constancy, dof, n_trials)
+    numbers = (*levels, *change, float(norm.isf(max(p, 1e-300) / 2)), dof, n_trials)
     row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
-    sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
-    return row | {"sentence": sentence, "p": min(1.0, len(p) * min(p)), "groups": groups}
+    return row | {"sentence": remark("drifts", row=row, **told), "p": p, "groups": groups}
 
 
 # ------------------------------------------------------------------------------
@@ -338,35 +334,28 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
 
 
 # ------------------------------------------------------------------------------
-# Tests of whether B of single trials varies with a condition: linear trend and differences.
+# Tests of whether B of single trials changes with a condition: a linear trend.
 
 
 def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
-    """Tests against one condition, of each vine alone and of all: of a linear trend, and by Fisher's F test whether all
-    levels have the same mean, both about the mean of each vine.
-    """
-    from scipy.stats import f as fisher
-
+    """Tests of a linear trend against one condition, of each vine alone and of all, about the mean of each vine."""
     levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
     linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
     coordinate, weight, vines = levels if linear else np.log(levels), 1 / estimates.variance, estimates.vines
-    usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
+    known = np.isfinite(estimates.deviation)
+    usable = np.isfinite(levels) & known
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    replicates = _of_replicates(estimates.deviation, weight, estimates.conditions)
+    apart, dof = within_groups(estimates.deviation[known], estimates.conditions[known], weight[known])
+    replicates = float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
     for vine in [*varying, *([""] if len(varying) > 1 else [])]:
         chosen = usable & (np.isin(vines, varying) if vine == "" and len(varying) > 1 else vines == vine)
         w, block, level = weight[chosen], vines[chosen], levels[chosen]
-        x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
+        x, d = (within_groups(values[chosen], block, w)[0] for values in (coordinate, estimates.deviation))
         n_vines = np.unique(block).size
         steady = _steady_change(x, d, w, replicates, n_vines)
         if steady is None:
             continue
         slope, sigma, p, variance, dof = steady
-        cells = [f"{name} {value!r}" for name, value in zip(block, level.tolist(), strict=True)]
-        between = len(set(cells)) - n_vines
-        means = d - _centred(d, w, np.array(cells))
-        chi2 = float(np.sum(w * means**2))
-        p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
         subject, groups = _subject(estimates.number, str(vine), against), []
         for value in np.unique(level).tolist() if n_vines == 1 else ():
             k = np.flatnonzero(chosen & (levels == value))
@@ -379,7 +368,7 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
         # Relative change from the smaller value, with its standard error
         larger = math.exp(abs(slope) * reach)
         change = larger - 1, larger * sigma * reach
-        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, (p, p_constancy), dof, d.size, groups)
+        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, p, dof, d.size, groups)
 
 
 def _steady_change(
@@ -404,20 +393,6 @@ def _steady_change(
     return slope, sigma, float(2 * student.sf(abs(slope) / sigma, dof)), variance, dof
 
 
-def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
-    """Deviations from the weighted mean of each group. Shapes: values, weight, groups (n,) → (n,)."""
-    _, group = np.unique(groups, return_inverse=True)
-    return np.asarray(values - (np.bincount(group, weight * values) / np.bincount(group, weight))[group])
-
-
-def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_]) -> tuple[float, int]:
-    """Variance of replicates about the mean of their condition, relative to 1/weight, and its degrees of freedom."""
-    known = np.isfinite(values)
-    dof = int(np.count_nonzero(known)) - np.unique(conditions[known]).size
-    apart = _centred(values[known], weight[known], conditions[known])
-    return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
-
-
 def against_the_sheet(fit: Fit) -> Iterator[Row]:
     """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
@@ -433,4 +408,4 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
         subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
         change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
-        yield _tested(subject, levels, change, (p,), math.inf, n_trials, stated_sigma_Pa=stated)
+        yield _tested(subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated)

@@ -1,36 +1,495 @@
 """Tests of one fitted model: is anything missing, and which effect would explain it. No model is refitted.
 
-A model is rejected by any of three kinds of test. Score tests are made of each candidate (`score_test`, with
-family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces, and a
-test of the trial effects (`between_conditions_p`). The last compares the misfit with the noise
-and the slow errors of the tracks.
+A model is rejected by any of three kinds of test. Score tests (Rao 1948) are made of each candidate, by linear algebra:
+about the fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
+the sensitivities to the candidates' sizes a. The random effects u_i of each trial, release, origin and the deviations
+of pressure and B, are integrated out, and the free parameters θ are projected off. Each candidate then has a score, an
+information, and a cosine with every other. Its standard error is computed twice: from the noise and the between-trial
+standard deviations of the fit, and from the scatter of the scores of single trials (White, Econometrica 48, 817, 1980,
+with trials as clusters), which is valid for many independent trials whatever the noise within a trial is like.
+
+Omnibus tests name no candidate: score tests of smooth probe forces, and a test of the trial effects
+(`between_conditions_p`). The last compares the misfit with the noise and the slow errors of the tracks.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtri
 
-from vinetrack.core.records import Floats
-from vinetrack.diagnosis.score_test import (
-    CandidateShape,
-    FamilyTest,
-    Products,
-    Scores,
-    family_test,
-    plausible_range,
-    products_of,
-    scores_of,
-    shapes_of,
+from vinetrack.core.problems import Remark, remark
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.replicates import within_groups
+from vinetrack.dynamics.model import Model, check_needs, probe, stated
+from vinetrack.dynamics.simulate import SimulationError, Trajectory
+from vinetrack.effects import Effect, EffectError, Parameter
+from vinetrack.inference.errors import cluster_variance, coarsest_groups
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import Fit, group_names
+from vinetrack.inference.gaussian_processes import whiten
+from vinetrack.inference.marginal_likelihood import (
+    FitState,
+    MixedProblem,
+    at_prior_means,
+    eliminated,
+    inverse_of_block,
+    summed,
+    trial_effect_prior,
 )
-from vinetrack.dynamics.model import probe
-from vinetrack.effects import Effect
-from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
+from vinetrack.inference.systematics import systematics_of
+
+# ------------------------------------------------------------------------------
+# Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
+
+NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
+
+REACH_SIGMAS = 2.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
+
+# Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
+RANGE_SHARE_BESIDE_SLIP = 0.5
+
+COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
+
+
+@dataclass(frozen=True)
+class CandidateShape:
+    """An effect in the form in which its size is tested: the first parameter is the size, the others are fixed. The
+    others are fixed at `other_values`. `step` is the step of the size in the finite difference. Where `whole`, the step
+    is a finite size, because the effect has no or another response to small sizes.
+    """
+
+    effect: Effect
+    other_values: tuple[float, ...]
+    step: float
+    whole: bool = False
+    group: str = ""
+    other_groups: tuple[str, ...] = ()
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Parameter values with the size one step from zero."""
+        return (self.size.zero + self.step, *self.other_values) if self.effect.parameters else ()
+
+    @property
+    def size(self) -> Parameter:
+        """The parameter that is the size of the effect."""
+        return self.effect.parameters[0]
+
+
+def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, Remark]]:
+    """Candidates that these trials can test, and the reason why not by name of each of the others."""
+    reasons = {effect.name: why for effect in candidates if (why := _untestable(effect, data))}
+    return tuple(effect for effect in candidates if effect.name not in reasons), reasons
+
+
+def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
+    """The reason why these trials cannot test an effect; blank where they can."""
+    trials, has_trace = [trial_data.trial for trial_data in data], [trial_data.trace is not None for trial_data in data]
+    of_tube = [column for column in effect.needs if column in ("chamber_l", "inlet_mm", "yield_pressure_kPa")]
+    if of_tube and all(trial.travel_ratio == 1 for trial in trials):
+        return remark("no_tube", column=of_tube[0])
+    if effect.in_trace and all(has_trace):
+        return remark("in_measured_pressure")
+    if "trace_time" in effect.functions and not any(has_trace):
+        return remark("no_measured_pressure")
+    if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
+        return remark(COLUMN_BLANK, column=absent[0])
+    try:
+        check_needs(Model((effect,)), *trials)
+    except EffectError:
+        return remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
+    return Remark()
+
+
+def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
+    """Shapes in which an effect is tried: every combination of typical values of its shape parameters. An effect whose
+    size may differ between vines or days is tried with one size for all, and in each group alone.
+    """
+    if not effect.parameters:
+        return [CandidateShape(effect, (), 1.0, whole=True)]
+    size, *others = effect.parameters
+    combinations = list(itertools.product(*(_typical_values(parameter) for parameter in others)))
+    shapes = [CandidateShape(effect, values, _first_step(size)) for values in combinations]
+    if others or effect.finite:
+        middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
+        shapes += whole_shapes(effect, middle)
+    groups = group_names(trials, size.shared)
+    if len(groups) > 1:
+        shapes += [
+            replace(shapes[0], group=group, other_groups=tuple(other for other in groups if other != group))
+            for group in groups
+        ]
+    return shapes
+
+
+def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
+    """Shapes of an effect at finite sizes within its plausible range."""
+    low, high = plausible_range(effect.parameters[0])
+    largest = high if abs(high) >= abs(low) else low
+    zero = effect.parameters[0].zero
+    # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
+    # infinitesimal size (chosen)
+    with_threshold = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+    fractions = with_threshold if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
+    return [
+        CandidateShape(effect, values, fraction * (largest - zero), whole=True)
+        for values in other_values
+        for fraction in fractions
+    ]
+
+
+def _first_step(size: Parameter) -> float:
+    """A size small compared with the plausible range."""
+    low, high = plausible_range(size)
+    return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
+
+
+def plausible_range(parameter: Parameter) -> tuple[float, float]:
+    """Plausible range of a parameter; where the effect states none, three times its default on either side of zero."""
+    if parameter.plausible is not None:
+        return parameter.plausible
+    low, high = parameter.bounds
+    reach = 3 * abs(parameter.default - parameter.zero) or 1.0
+    return max(low, parameter.zero - reach), min(high, parameter.zero + reach)
+
+
+def _typical_values(parameter: Parameter) -> tuple[float, ...]:
+    """Values that the effect names; else three that span the plausible range, or its middle where that is narrow."""
+    if parameter.tried:
+        return parameter.tried
+    low, high = plausible_range(parameter)
+    # 10.0: ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
+    if low > 0 and high / low > 10.0:
+        return tuple(np.geomspace(low, high, 5)[1:4].tolist())
+    if low > 0 and high / low < NARROW_RANGE:
+        return ((low + high) / 2,)
+    return tuple((low + fraction * (high - low)) for fraction in (0.15, 0.5, 0.85))
+
+
+def slip_of(parameter: Parameter, value: float, sigma: float) -> tuple[float, str] | None:
+    """The size that a common slip in the sheet produces, and what was done, where a fitted size is that up to an
+    ordinary error; None where no slip fits.
+    """
+    if parameter.plausible is None:
+        return None
+    low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
+    for size, action in parameter.slips:
+        remaining, margin = (1 + value) / (1 + size) - 1, REACH_SIGMAS * sigma / (1 + size)
+        if low - margin <= remaining <= high + margin:
+            return size, action
+    return None
+
+
+def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: float = 1.0) -> bool:
+    """Whether a value lies in the plausible range, within its error of it, or is that of a slip."""
+    if parameter.plausible is None or value == parameter.zero or slip_of(parameter, value, sigma) is not None:
+        return True
+    low, high = parameter.plausible
+    if math.isfinite(parameter.period):
+        value = low + (value - low) % parameter.period
+    if low > 0 and high / low > NARROW_RANGE:
+        # 3.0: factor by which a size may lie below a range that is not narrow (chosen)
+        low /= 3.0
+    low, high = min(low / widened, low * widened), max(high * widened, high / widened)
+    margin = REACH_SIGMAS * sigma if math.isfinite(sigma) else math.inf
+    return bool(low - margin <= value <= high + margin)
+
+
+# ------------------------------------------------------------------------------
+# Sensitivities of a fit's trajectories to effects that are not in its model.
+#
+# Each column is the change of a trial's positions per unit of an effect's size, with the effect added to the fitted
+# model and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross
+# products, from which score tests, cosines and expected gains follow by linear algebra.
+
+
+def _sensitivities(
+    fit: Fit, shapes: Sequence[CandidateShape]
+) -> tuple[list[tuple[CandidateShape, list[Floats]]], list[str]]:
+    """Sensitivities to all shapes of all candidate effects, and the effects to which no trajectory responds at any
+    plausible size: without a response to a small step finite sizes are tried.
+    """
+    baseline = fit.predictor.trajectories_at(fit.solution.state.theta, fit.solution.state.trial_effects)
+    responses, silent = list[tuple[CandidateShape, list[Floats]]](), list[str]()
+    for name in dict.fromkeys(shape.effect.name for shape in shapes):
+        of_effect = [shape for shape in shapes if shape.effect.name == name]
+        responding = [each for shape in of_effect if (each := _sensitivity(fit, shape, baseline)) is not None]
+        if not responding and any(shape.effect.parameters for shape in of_effect):
+            finite = whole_shapes(of_effect[0].effect, [of_effect[0].other_values])
+            responding = [each for shape in finite if (each := _sensitivity(fit, shape, baseline)) is not None]
+        responses += responding
+        silent += [] if responding else [name]
+    return responses, silent
+
+
+def _sensitivity(
+    fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]
+) -> tuple[CandidateShape, list[Floats]] | None:
+    """Change of all positions per unit of size, and the shape with the step used; None without a response."""
+    # Part of its travel by which a trajectory must change to count as responding, four times the integrator's
+    # error (measured)
+    least_detectable_response = 3e-6
+    try:
+        change = _change(fit, shape, baseline)
+        response = _response(fit, change)
+        if shape.whole:
+            usable = response > least_detectable_response and not _prevents_growth(baseline, change)
+            return (shape, [moved / shape.step for moved in change]) if usable else None
+        if response <= least_detectable_response * 1e-3:
+            return None
+        # 2e-3, 2e-2, 2e-4: A finite-difference step should move a trajectory by the first of these parts of
+        # its travel (derived)
+        if not 2e-4 < response < 2e-2:
+            size = shape.size
+            step = shape.step * 2e-3 / response
+            available = size.bounds[1] - size.zero if shape.step > 0 else size.zero - size.bounds[0]
+            shape = replace(shape, step=min(step, available) if available > 0 else step)
+            change = _change(fit, shape, baseline)
+            response = _response(fit, change)
+    except SimulationError:
+        return None
+    return (shape, [moved / shape.step for moved in change]) if response > least_detectable_response else None
+
+
+def _prevents_growth(baseline: Sequence[Trajectory], change: Sequence[Floats]) -> bool:
+    """Whether some vine that grew in the recording hardly starts with the effect: so large a size is excluded."""
+    # 0.1: part of its travel that a vine must still make with a finite effect added (chosen)
+    return any(
+        float(np.max(before.observed_position_m + moved)) < 0.1 * float(np.max(before.observed_position_m))
+        for before, moved in zip(baseline, change, strict=True)
+    )
+
+
+def _response(fit: Fit, change: Sequence[Floats]) -> float:
+    """Largest change of a trial, as part of its travel; infinite where one cannot be simulated."""
+    spans = [max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in fit.trials]
+    parts = [float(np.max(np.abs(moved))) / span for moved, span in zip(change, spans, strict=True)]
+    worst = max(parts, default=0.0)
+    return worst if math.isfinite(worst) else math.inf
+
+
+def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> list[Floats]:
+    """Change of the positions of every trial with the step of the shape added, m."""
+    predictor, state = fit.predictor, fit.solution.state
+    jobs = predictor.jobs(state.theta, state.trial_effects).with_effect(shape.values)
+    shared = shape.size.shared if shape.group else ""
+    affected = [i for i, trial in enumerate(fit.trials) if trial.trial.group(shared) == shape.group]
+    changed = predictor.run(jobs[affected], model=predictor.layout.model + shape.effect)
+    change = [np.zeros(before.time_s.size) for before in baseline]
+    for i, trajectory in zip(affected, changed, strict=True):
+        change[i] = position_change(baseline[i], trajectory)
+    return change
+
+
+# ------------------------------------------------------------------------------
+# Columns of a fit and of candidates, and their cross products by trial.
+#
+# In this order: trial effects, unknowns, residual, shapes of candidates. The unknowns are the parameters of the fit and
+# its systematic errors, which have a standard normal prior each.
+
+
+@dataclass(frozen=True)
+class Products:
+    """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the fit's
+    noise, shape (n_trials, n_columns, n_columns). `problem` is that of the fit with the systematic errors as further
+    parameters; `silent` names the effects to which no trajectory responds at any plausible size.
+    """
+
+    white: Floats
+    problem: MixedProblem
+    shapes: tuple[CandidateShape, ...] = ()
+    silent: tuple[str, ...] = ()
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Name of the effect of each shape."""
+        return tuple(shape.effect.name for shape in self.shapes)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of columns of the unknowns of a trial."""
+        return self.problem.index.shape[1]
+
+    def without_trial_effects(self, state: FitState) -> Floats:
+        """Those of unknowns, residual and shapes, the trial effects integrated out."""
+        restored = at_prior_means(self.white, self.problem, state, N_TRIAL_EFFECTS + self.n_unknowns)
+        return eliminated(restored, trial_effect_prior(self.problem, state)[1])[0]
+
+
+def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
+    """Cross products of columns of one trial in units of its noise. Shapes: columns (n_points, k) → (k, k)."""
+    trial_data, state = fit.predictor.data[i], fit.state
+    white = whiten(columns, trial_data.first, state.rho, trial_data.relative_sd)
+    return np.asarray(white.T @ white / state.variance[i])
+
+
+def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
+    """Cross products of a fit, of its systematic errors and of the candidates; no trial's columns are held twice."""
+    responses, silent = _sensitivities(fit, shapes)
+    systematics, white = systematics_of(fit.predictor, fit.solution), list[Floats]()
+    for i, of_fit in enumerate(systematics.beside(fit.solution.columns)):
+        white.append(in_noise(fit, i, np.column_stack([of_fit, *(moved[i] for _, moved in responses)])))
+        for _, moved in responses:
+            moved[i] = np.empty(0)
+    problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
+    return Products(np.stack(white), problem, responding, tuple(silent))
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Score statistics of every shape given the fit, per unit of its size; those of trials (n_trials, n_shapes).
+    `fitted` counts the parameters of the fit that are estimated; `levers` are the changes of the unknowns by a unit of
+    each size, (n_unknowns, n_shapes).
+    """
+
+    score: Floats
+    information: Floats
+    trial_scores: Floats
+    trial_informations: Floats
+    fitted: int
+    groups: Sequence[str]
+    levers: Floats
+
+    @property
+    def degrees(self) -> float:
+        """Degrees of freedom of the scatter of trials."""
+        clusters = len(set(self.groups))
+        spare = len(self.groups) - self.fitted
+        return float(max(min(spare, clusters - 1), 1))
+
+    @property
+    def informed(self) -> Floats:
+        """Information about every size alone; NaN where the data hold none."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, diagonal, math.nan)
+
+    @property
+    def size(self) -> Floats:
+        """One-step estimate of every size, each alone; 0 where the data hold no information."""
+        return np.nan_to_num(self.score / self.informed)
+
+    @property
+    def sigma(self) -> Floats:
+        """Standard error of every size, the larger of both kinds; infinite where the data hold no information."""
+        return np.maximum(self.plain_sigma, self.robust_sigma)
+
+    @property
+    def plain_sigma(self) -> Floats:
+        """Standard error from the noise and the between-trial standard deviations of the fit."""
+        return np.nan_to_num(1 / np.sqrt(self.informed), nan=math.inf)
+
+    @property
+    def robust_sigma(self) -> Floats:
+        """Cluster-robust standard error, from the scatter of trial scores about what the size predicts. 0 for few
+        trials, see `cluster_variance`.
+        """
+        residual = self.trial_scores - self.trial_informations * self.size
+        scatter = np.sqrt(cluster_variance(residual, self.fitted, self.groups))
+        return np.nan_to_num(scatter / self.informed, nan=math.inf)
+
+    def one_sided(self, signs: Sequence[int]) -> Floats:
+        """Score of every shape in standard errors (z) where its sign, 0 for either, is allowed; 0 where it is not. The
+        smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to the
+        normal quantile of the same tail probability.
+        """
+        from scipy.stats import norm, t
+
+        size, sign = self.size, np.array(signs)
+        allowed_size = np.where(sign == 0, np.abs(size), np.maximum(size * sign, 0.0))
+        z = allowed_size / self.plain_sigma
+        with np.errstate(divide="ignore", invalid="ignore"):
+            robust_t = np.where(self.robust_sigma > 0, allowed_size / self.robust_sigma, np.inf)
+        log_tail = t.logsf(np.minimum(robust_t, 1e6), max(self.degrees, 3.0))
+        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(log_tail, -700.0)))))
+
+    @property
+    def cosines(self) -> Floats:
+        """Correlations of the scores, −1 to 1, shape (n_shapes, n_shapes)."""
+        root = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
+
+
+def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
+    """Compute the scores at a fit, or with other between-trial scatter: shapes and residual with the trial effects
+    eliminated and the unknowns projected off.
+    """
+    state, problem, p = state or fit.state, products.problem, products.n_unknowns
+    X, r, C = slice(0, p), p, slice(p + 1, None)
+    blocks = products.without_trial_effects(state)
+    # Systematic errors are at their prior means.
+    unknowns = np.append(state.theta, problem.prior_mean[state.theta.size :])
+    hessian, gradient, _ = summed(np.ascontiguousarray(blocks[:, : p + 1, : p + 1]), problem, unknowns)
+    # Unknowns to which a trial does not respond are added up in a last row, and dropped.
+    cross = np.zeros((problem.prior_mean.size + 1, blocks.shape[-1] - p - 1))
+    np.add.at(cross, problem.index, blocks[:, X, C])
+    total = blocks[:, C, C].sum(axis=0)
+    # Those adapt to an effect that are estimated and not at a bound.
+    at_bound = np.zeros(len(hessian), dtype=bool)
+    at_bound[: len(fit.numbers)] = [math.isfinite(number.bound) for number in fit.numbers]
+    adapting = np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~at_bound)
+    inverse = inverse_of_block(hessian, adapting)
+    levers, step = inverse @ cross[:-1], inverse @ gradient
+    information = total - cross[:-1].T @ levers
+    # 1e-9: share of its information below which what remains of a shape is rounding, because other columns
+    # reproduce it exactly (derived)
+    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
+    information[empty, :] = information[:, empty] = 0.0
+    score = np.where(empty, 0.0, blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step)
+    # Of single trials; unknowns to which one does not respond point at a last row of zeros.
+    of_trial, steps = np.pad(levers, ((0, 1), (0, 0)))[problem.index], np.append(step, 0.0)[problem.index]
+    residual = blocks[:, :, r] - np.einsum("nap,np->na", blocks[:, :, X], steps)
+    trial_scores = residual[:, C] - np.einsum("npk,np->nk", of_trial, residual[:, X])
+    trial_informations = np.einsum("nkk->nk", blocks[:, C, C]) + np.einsum(
+        "npk,npk->nk", of_trial, blocks[:, X, X] @ of_trial - 2 * blocks[:, X, C]
+    )
+    return Scores(
+        score,
+        information,
+        np.where(empty, 0.0, trial_scores),
+        trial_informations,
+        fitted=int(np.count_nonzero(adapting < state.theta.size)),
+        groups=coarsest_groups([trial.trial for trial in fit.trials]),
+        levers=levers,
+    )
+
+
+# ------------------------------------------------------------------------------
+# Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
+#
+# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
+# for all scores the first would take most of the false alarms and raise the threshold of the second. Each candidate
+# therefore has the same probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are
+# effectively independent.
+
+
+def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> defaultdict[str, float]:
+    """Thresholds of candidates, by name, in standard deviations of a score, that any exceeds with a probability of
+    about `level`, less where candidates are alike. A candidate without shapes has that of a single score of either
+    sign. Shapes: cosines (n_shapes, n_shapes).
+    """
+    informative = np.diag(cosines) > 0
+    shapes = {name: [k for k, other in enumerate(effects) if other == name and informative[k]] for name in effects}
+    shapes = {name: of_effect for name, of_effect in shapes.items() if of_effect}
+    share = level / max(len(shapes), 1)
+    single = -float(ndtri(share / 2))
+    thresholds = defaultdict(lambda: single)
+    for name, of_effect in shapes.items():
+        sides = 2 if signs[of_effect[0]] == 0 else 1
+        # Effective number of independent shapes: Galwey, Genetic Epidemiology 33, 559 (2009).
+        eigenvalues = np.maximum(np.linalg.eigvalsh(cosines[np.ix_(of_effect, of_effect)]), 0.0)
+        count = float(np.sum(np.sqrt(eigenvalues)) ** 2 / np.sum(eigenvalues))
+        thresholds[name] = -float(ndtri(share / sides / count))
+    return thresholds
+
 
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
@@ -58,13 +517,6 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
             for offset in (0, 3) if varied and kind == 0 else (0,):
                 shapes.append(CandidateShape(probe(), (float(kind + offset), float(centre), 0.6 * top / count), 1e-3))
     return shapes
-
-
-def any_probe_exceeds(scores: Scores, level: float) -> bool:
-    """Whether the score of some probe exceeds the threshold of so many bumps, of either sign."""
-    signs, names = [0] * scores.score.size, ["probe"] * scores.score.size
-    threshold = family_test(scores.cosines, signs, names, level).threshold("probe")
-    return bool(np.max(scores.one_sided(signs), initial=0.0) > threshold)
 
 
 # ------------------------------------------------------------------------------
@@ -108,7 +560,10 @@ def _by_conditions(fit: Fit) -> list[tuple[float, bool]]:
     # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
     pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
     groups = [trial.trial.condition for trial in fit.trials]
-    fitted, (pressure_sd, damping_sd) = sum(not math.isfinite(number.bound) for number in fit.numbers), fit.state.spread
+    # Parameters with a prior, such as P_y, hardly adapt to the differences between conditions.
+    at_bound = np.isfinite([number.bound for number in fit.numbers])
+    fitted = int(np.count_nonzero((fit.predictor.layout.prior_precision == 0) & ~at_bound))
+    pressure_sd, damping_sd = fit.state.spread
     p_values = (
         _anova_p(np.array([trial.pressure_deviation for trial in fit.trials]), groups, fitted, pressure),
         _anova_p(np.log1p([trial.damping_deviation for trial in fit.trials]), groups, fitted, CAREFUL_DAMPING_SCATTER),
@@ -123,12 +578,11 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     """
     from scipy.stats import f
 
-    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
-    mean = np.bincount(group, values) / count
-    inner, outer = values.size - count.size, count.size - fitted
+    apart, inner = within_groups(values, groups)
+    outer = values.size - inner - fitted
     if inner < MIN_REPLICATE_DEGREES or outer < 1:
         return math.nan
-    within, between = float(np.sum((values - mean[group]) ** 2)), float(np.sum(count * mean**2))
+    within, between = float(np.sum(apart**2)), float(np.sum((values - apart) ** 2))
     if not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
@@ -192,14 +646,14 @@ class MisfitTests:
         return [shape.size.sign if shape.effect.parameters else 1 for shape in self.products.shapes]
 
     @cached_property
-    def family(self) -> FamilyTest:
+    def family(self) -> defaultdict[str, float]:
         """Thresholds of z for the candidates, such that any exceeds its own by chance with probability `level`."""
         return family_test(self.scores.cosines, self.signs, self.products.effects, self.level)
 
     def any_exceeds(self, level: float) -> bool:
         """Whether any candidate exceeds its threshold at a level that all of them share."""
         family = family_test(self.scores.cosines, self.signs, self.products.effects, level)
-        thresholds = np.array([family.threshold(name) for name in self.products.effects])
+        thresholds = np.array([family[name] for name in self.products.effects])
         return bool(np.any(self.one_sided_z > thresholds))
 
     @property
@@ -226,8 +680,8 @@ class MisfitTests:
     @cached_property
     def probes_reject(self) -> bool:
         """Whether a smooth force would improve the fit."""
-        scores = scores_of(self.fit, products_of(self.fit, _probe_shapes(self.fit)))
-        return any_probe_exceeds(scores, min(PROBE_LEVEL, self.level))
+        products, level = products_of(self.fit, _probe_shapes(self.fit)), min(PROBE_LEVEL, self.level)
+        return MisfitTests(self.fit, (), products, scores_of(self.fit, products), level).any_exceeds(level)
 
     @cached_property
     def predicted_gains(self) -> Floats:

@@ -23,26 +23,27 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.force_laws import FORMS, STATE
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
-    CandidateFits,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import (
+    FORMS,
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
+    STATE,
     VARIABLES,
     Domain,
     LearnedForce,
     RankedLaw,
     missing_force,
 )
+from vinetrack.diagnosis.selection import Search
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, own_effects, remember
 from vinetrack.inference.fit import refit
@@ -86,7 +87,7 @@ def add(
 def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
     """Fit a model with an effect added, as a diagnosis does; from the effect's own values where that gains nothing."""
     tests = misfit_tests(before, (effect,), FALSE_ALARM_LEVEL_FIRST_ROUND)
-    fits = [ratio.fit for ratio in CandidateFits(tests, report).fit(all_of_them=True)]
+    fits = [ratio.fit for ratio in Search(tests, report).extend(every=True)]
     if not fits or fits[0].log_likelihood < before.log_likelihood:
         fits.append(refit(before, before.model + effect))
     return max(fits, key=lambda fit: fit.log_likelihood)
@@ -97,7 +98,7 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 #
 # Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
 # coefficients of its splines, N, at even steps of each normalised variable (`missing_force.Domain`), and a function
-# that sums the four splines that are nonzero:
+# that sums them:
 #
 #     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
 #
@@ -178,29 +179,22 @@ def _parameter(names: Sequence[str], value: str, bounds: Sequence[float], plausi
 
 
 def _table_code(domain: Domain) -> list[str]:
-    """Lines of code that find the interval of the table in which a state lies, and sum the splines that are nonzero."""
-    lines, loops, splines, places = [], [], "", []
-    for depth, (axis, at, place, k) in enumerate(zip(domain.axes, "uv", "ij", "km", strict=False)):
+    """Lines of code that sum the splines of the table at a state."""
+    places, loops = list[str](), list[str]()
+    for depth, (axis, at, k) in enumerate(zip(domain.axes, "uv", "km", strict=False)):
         low, width = (repr(float(f"{value:.12g}")) for value in (axis.low, axis.high - axis.low))
         part = f"np.minimum(np.maximum((s.{_STATE[axis.name]} - {low}) / {width}, 0.0), 1.0)"
         if axis.log_ratio:
             part = f"np.log1p({axis.log_ratio!r} * {part}) / np.log1p({axis.log_ratio!r})"
-        lines += [
-            f"{at} = {axis.count - 3}.0 * {part}",
-            f"{place} = np.maximum(np.minimum(np.int64({at}), {axis.count - 4}), 0)",
-            f"{at} = {at} - {place}",
-            f"of_{at} = (",
-            f"    (1.0 - {at}) ** 3 / 6.0,",
-            f"    (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0,",
-            f"    (1.0 + 3.0 * {at} + 3.0 * {at}**2 - 3.0 * {at}**3) / 6.0,",
-            f"    {at}**3 / 6.0,",
-            ")",
+        places.append(f"{at} = 1.0 + {axis.count - 3}.0 * {part}")
+        loop = [
+            f"for {k} in range({axis.count}):",
+            f"    d = np.abs({at} - {k})",
+            f"    of_{at} = (np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0",
         ]
-        loops.append(f"{'    ' * depth}for {k} in range(4):")
-        splines += f"of_{at}[{k}] * "
-        places.append(f"{place} + {k}")
-    step = f"{'    ' * len(loops)}total = total + {splines}TABLE[{', '.join(places)}]"
-    return [*lines, "total = 0.0", *loops, step, "return a * total"]
+        loops += [f"{'    ' * depth}{line}" for line in loop]
+    terms = "TABLE[k] * of_u" if len(domain.axes) == 1 else "TABLE[k, m] * of_u * of_v"
+    return [*places, "total = 0.0", *loops, f"{'    ' * len(domain.axes)}total = total + {terms}", "return a * total"]
 
 
 # ------------------------------------------------------------------------------

@@ -14,9 +14,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial, with_flag
@@ -195,6 +197,16 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
 # The trials of one condition, each laid on the model by its own release and origin.
 
 
+def within_groups(
+    values: Floats, groups: Sequence[str] | NDArray[np.str_], weight: Floats | float = 1.0
+) -> tuple[Floats, int]:
+    """Deviations from the weighted mean of each group, and their degrees of freedom. Shapes: values (n, …)."""
+    names, group = np.unique(groups, return_inverse=True)
+    shares = np.where(group == np.arange(names.size)[:, None], weight, 0.0)
+    means = (shares / shares.sum(axis=1, keepdims=True)) @ values
+    return np.asarray(values - means[group]), len(group) - names.size
+
+
 @dataclass(frozen=True)
 class Replicates:
     """Trials of one condition: all `frames`, since release and from the origin, with the mean of the replicates then
@@ -284,10 +296,24 @@ class AlignedTrials:
     `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`; `trials` are those predicted.
     """
 
+    fit: Fit
     predictor: Predictor
     trial_effects: Floats
     columns: tuple[Floats, ...]
     trials: Sequence[TrialFit]
+
+    @cached_property
+    def courses(self) -> dict[str, list[ResidualCourse]]:
+        """Residuals of the trials of each condition, by its name, in order."""
+        courses: dict[str, list[ResidualCourse]] = {}
+        for i, trial in enumerate(self.trials):
+            courses.setdefault(trial.trial.condition, []).append(_course(self, i, trial))
+        return courses
+
+    @cached_property
+    def scatter(self) -> Scatter:
+        """The scatter of replicates."""
+        return _replicate_scatter(self.fit, list(self.courses.values()))
 
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""
@@ -297,7 +323,8 @@ class AlignedTrials:
 def align_trials(fit: Fit) -> AlignedTrials:
     """Align the model with the trials that it was fitted to, by release and origin."""
     predictor, trial_effects, trials = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
-    return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)), trials)
+    columns = tuple(predictor.linearise(np.empty(0), trial_effects))
+    return AlignedTrials(fit, predictor, trial_effects, columns, trials)
 
 
 def orthogonal_part(columns: Floats, others: Floats) -> Floats:
@@ -339,11 +366,6 @@ class ResidualCourse:
         return np.asarray(np.diag(self.noise_m2 / np.maximum(count, 1.0)) + self.origin_m2)
 
 
-def residual_courses(aligned: AlignedTrials) -> list[ResidualCourse]:
-    """Courses of the trials of a fit."""
-    return [_course(aligned, *of_trial) for of_trial in enumerate(aligned.trials)]
-
-
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
     """The course of one trial. Responses are orthogonal to those to release and origin. Where growth has ended in the
     model they would be zero, but the vine may still grow: the last values are kept.
@@ -367,22 +389,6 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
     )
 
 
-def by_condition(courses: Sequence[ResidualCourse]) -> dict[str, list[ResidualCourse]]:
-    """Courses by name of condition, in order."""
-    names = dict.fromkeys(course.trial.condition for course in courses)
-    return {name: [course for course in courses if course.trial.condition == name] for name in names}
-
-
-def common_edges(members: Sequence[ResidualCourse]) -> Floats:
-    """Edges of stretches of time that every replicate was recorded in. Shape (n_stretches + 1,)."""
-    start = max(float(member.time_s[0]) for member in members)
-    end = min(float(member.time_s[-1]) for member in members)
-    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
-    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
-    count = max(min(MAX_STRETCHES, frames // 2), 1)
-    return np.linspace(start, max(end, start), count + 1)
-
-
 class Stretches(NamedTuple):
     """Stretches of time that all replicates of a condition cover: mean residuals, shape (n_trials, n), their responses
     to pressure and ln B, (n, 2), and their covariance from the noise of the tracks alone, (n, n).
@@ -394,8 +400,13 @@ class Stretches(NamedTuple):
 
 
 def common_stretches(members: Sequence[ResidualCourse]) -> Stretches:
-    """The stretches in which all members have frames."""
-    parts = [member.means("time_s", common_edges(members)) for member in members]
+    """The stretches in which all members have frames, of the time that all were recorded in."""
+    start = max(float(member.time_s[0]) for member in members)
+    end = min(float(member.time_s[-1]) for member in members)
+    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
+    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
+    edges = np.linspace(start, max(end, start), max(min(MAX_STRETCHES, frames // 2), 1) + 1)
+    parts = [member.means("time_s", edges) for member in members]
     all_means = np.array([means for means, _ in parts])
     reached = np.isfinite(all_means).all(axis=(0, 2))
     noise = [member.noise(count[reached]) for member, (_, count) in zip(members, parts, strict=True)]
@@ -422,13 +433,13 @@ class Scatter:
         return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 
 
-def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
+def _replicate_scatter(fit: Fit, courses: Sequence[Sequence[ResidualCourse]]) -> Scatter:
     """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates."""
     from scipy.optimize import minimize
 
     start_values = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
     lower_bounds, upper_bounds = np.log((1e-5, 1e-5, 1e-3)), np.log((0.2, 0.5, 3.0))  # Bounds of the search (chosen)
-    groups = [common_stretches(members) for members in by_condition(courses).values() if len(members) > 1]
+    groups = [common_stretches(members) for members in courses if len(members) > 1]
     dof = sum(len(group.means_m) - 1 for group in groups)
     if dof < 1:
         spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]

@@ -9,7 +9,7 @@ is added: first single effects are tried, then sets of two to five. If no set pa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,35 +22,38 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import (
     OUT_OF_REACH,
-    CandidateFits,
     LikelihoodRatio,
-    Report,
     answer_set,
     best_of,
-    drop_curves,
     full_fit,
     in_sigmas,
+    is_large,
     likelihood_ratio,
     robust_ratio,
     sizes_of,
+    start_values,
     with_curves,
+    without_curves,
 )
 from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
+    FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
+    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     has_excess_scatter,
     misfit_tests,
+    plausible_range,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
-from vinetrack.diagnosis.score_test import CandidateShape, plausible_range
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 
 if TYPE_CHECKING:
@@ -58,8 +61,8 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# Sets of several effects, by forward steps: effects are added to the best sets of k effects, those that the score tests
-# predict to improve the fit most.
+# Fits of effects, and of sets of them by forward steps: from the best sets of k effects, those are added that the score
+# tests predict to improve the fit most.
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
@@ -67,36 +70,87 @@ MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 # (chosen)
 PARTIAL_SHARE = 0.5
 
+FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
+
+MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
+
+STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
+
 Names = frozenset[str]
 
+Report = Callable[[str], None]  # Called with a few words on what is being done
 
-class EffectSets:
-    """Sets of effects fitted from one model, by their names. A set is fitted again only from a better start."""
 
-    def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio]) -> None:
-        self.search = search
-        self.before = search.tests.fit
+class Search:
+    """Sets of effects fitted from one model, by their names: the best fit of each."""
+
+    def __init__(self, tests: MisfitTests, report: Report) -> None:
+        self.tests, self.before, self.report = tests, tests.fit, report
         self.fitted: dict[Names, LikelihoodRatio] = {}
-        for single in singles:
-            self._keep_best(single)
+        self.tried: set[tuple[Names, str]] = set()
+        self.tests_by_fit: list[tuple[Fit, MisfitTests]] = []
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
         """Fitted sets of this many effects, the highest likelihood first."""
         of_size = [hypothesis for names, hypothesis in self.fitted.items() if len(names) == size]
         return sorted(of_size, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
 
+    def tests_after(self, fit: Fit) -> MisfitTests:
+        """Run the misfit tests of one of the fits, at the level of later rounds."""
+        for tested_fit, tests in self.tests_by_fit:
+            if tested_fit is fit:
+                return tests
+        tests = misfit_tests(with_curves(fit), self.tests.effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
+        if is_large(fit):
+            self.tests_by_fit.clear()
+        self.tests_by_fit.append((fit, tests))
+        return tests
+
+    def extend(
+        self, base: LikelihoodRatio | None = None, most: int | None = None, *, every: bool = False
+    ) -> list[LikelihoodRatio]:
+        """Add candidates of large predicted gain to a set, at `most` so many, or every one: a model whose parameters
+        have adapted to the lack of an effect may predict no gain for it, not even the right sign. Returns all sets of
+        this size.
+        """
+        tests, effects = (self.tests_after(base.fit), base.effects) if base else (self.tests, ())
+        gains = {name: tests.predicted_gain(name) for name in dict.fromkeys(tests.products.effects)}
+        names, of_base = sorted(gains, key=lambda name: -gains[name]), frozenset(effect.name for effect in effects)
+        if not every:
+            names = [name for name in names if gains[name] > MIN_SHARE_OF_BEST_PREDICTION * gains[names[0]]][:most]
+        for name in names:
+            if (of_base, name) not in self.tried:
+                self.tried.add((of_base, name))
+                self._fit_from_prediction(tests, effects, name)
+        return self.of_size(len(effects) + 1)
+
+    def _fit_from_prediction(self, tests: MisfitTests, effects: Sequence[Effect], name: str) -> None:
+        """Add an effect in its shapes of largest predicted gain, until one gains what is predicted."""
+        self.report(f"fitting {name}")
+        for index in tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
+            shape, size = tests.products.shapes[index], float(tests.scores.size[index])
+            # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
+            credible = [known for known in self.of_size(len(effects) + 1) if known.plausible and known.credible]
+            best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
+            model = tests.fit.model.with_effects((shape.effect,))
+            near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
+            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best, once=near)
+            gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
+            if fit is not None and gain >= FAILED_FIT_DELTA_CHI2:
+                self._keep_best(likelihood_ratio(self.before, (*effects, shape.effect), fit))
+            # 0.7: share of its predicted gain that a fit must reach for no other shape to be tried (chosen)
+            if gain > 0.7 * tests.predicted_gain(name):
+                break
+
     def grow(self, size: int) -> list[LikelihoodRatio]:
         """Fit sets of this many effects, built on the best sets of one fewer."""
-        n_partners = 3  # partners tried with each base (chosen)
         # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
         bases = self.of_size(size - 1)[: 3 if size == 2 else 2]
         for base in bases:
             # 0.3: share of the best set's gain from which larger ones are built on a set (chosen)
-            if base.delta_chi2 < 0.3 * bases[0].delta_chi2:
-                continue
-            search = CandidateFits(self.search.tests_after(base.fit), self.search.report)
-            for partner in search.fit(n_partners):
-                self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
+            if base.delta_chi2 >= 0.3 * bases[0].delta_chi2:
+                # 3: partners tried with each base (chosen)
+                self.extend(base, 3)
         return self.of_size(size)
 
     def subset(
@@ -122,11 +176,11 @@ class EffectSets:
         """Find the first member of a set whose significance given the others is too low, or not known."""
         for effect in hypothesis.effects:
             sigmas, required = 0.0, SEARCH_SIGMAS
-            self.search.report(f"taking out {effect.name}")
+            self.report(f"taking out {effect.name}")
             others = [other for other in hypothesis.effects if other is not effect]
             if (smaller := self.subset(hypothesis, others, again=True)) is not None:
                 sigmas = _worth(hypothesis, smaller, (effect,))
-                required = max(required, self.search.tests_after(smaller.fit).family.threshold(effect.name))
+                required = max(required, self.tests_after(smaller.fit).family[effect.name])
             if sigmas < required:
                 return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
         return Remark()
@@ -137,9 +191,9 @@ class EffectSets:
         that was fitted, so the criterion is then the stricter.
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
-        family = self.search.tests_after(smaller.fit).family
+        family = self.tests_after(smaller.fit).family
         added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
-        return _worth(hypothesis, smaller, added) >= max(family.threshold(effect.name) for effect in added)
+        return _worth(hypothesis, smaller, added) >= max(family[effect.name] for effect in added)
 
     def partial_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant;
@@ -157,12 +211,12 @@ class EffectSets:
         return tuple(step for step in steps if step is not None)
 
     def _keep_best(self, hypothesis: LikelihoodRatio) -> None:
-        """Keep a set unless a fit of the same effects with a higher likelihood is known; drop curves not needed."""
+        """Keep a set unless a fit of the same effects with a higher likelihood is known."""
         names = frozenset(hypothesis.names)
         known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
-            self.fitted[names] = hypothesis
-            drop_curves(self.fitted)
+            fit = hypothesis.fit
+            self.fitted[names] = replace(hypothesis, fit=without_curves(fit)) if is_large(fit) else hypothesis
 
 
 def _worth(larger: LikelihoodRatio, smaller: LikelihoodRatio, added: Sequence[Effect]) -> float:
@@ -182,7 +236,7 @@ MISFIT_REMAINS = remark("misfit_remains")
 
 
 def adequate_hypotheses(
-    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
+    hypotheses: Sequence[LikelihoodRatio], search: Search
 ) -> tuple[list[LikelihoodRatio], dict[str, Remark], MisfitTests | None]:
     """Test the model with each hypothesis of the answer set added, and keep those that no test rejects. A hypothesis
     that leaves a significant misfit is rejected, and no longer sets the likelihood that others are compared with.
@@ -198,14 +252,16 @@ def adequate_hypotheses(
             continue
         if hypothesis not in answer_set([*adequate, hypothesis])[0]:
             continue
-        tests = search.tests_after(hypothesis.fit) if hypothesis.credible else None
+        if not hypothesis.credible:
+            rejected[hypothesis.label] = hypothesis.reason
+            continue
+        tests = search.tests_after(hypothesis.fit)
+        hypothesis = replace(hypothesis, fit=tests.fit)
         # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
         # first round, which rejects more readily.
-        if tests is None:
-            rejected[hypothesis.label] = hypothesis.reason
-        elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
+        if tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
             rejected[hypothesis.label] = MISFIT_REMAINS
-        elif sets is not None and len(hypothesis.effects) > 2 and (reason := sets.superfluous(hypothesis)):
+        elif len(hypothesis.effects) > 2 and (reason := search.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
         else:
             adequate.append(hypothesis)
@@ -322,7 +378,7 @@ def _still_drifts(fit: Fit) -> Iterator[Remark]:
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return
     table = result.table
-    sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > CONTRADICTING_DRIFT_SIGMAS)]
+    sure = table[table["significant"] & (table["z"] > CONTRADICTING_DRIFT_SIGMAS)]
     for line in sure.drop_duplicates(["parameter", "against"])["sentence"]:
         yield remark("still_drifts", model=list(fit.model.names), drift=line)
 
@@ -388,10 +444,10 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return [SelectionStep(ADEQUATE, tests, unstated_differences=tuple(between_fits(fit, differing, 0.0, report)))]
 
     # The most promising single effects, a tail that may go slack, and differences between trials.
-    search = CandidateFits(tests, report)
+    search = Search(tests, report)
     slack = slack_fit(fit, report) if tests.rejects_model else None
     alone = [] if slack is None else [slack]
-    best_gain = max((hypothesis.delta_chi2 for hypothesis in (*search.fit(), *alone)), default=0.0)
+    best_gain = max((hypothesis.delta_chi2 for hypothesis in (*search.extend(), *alone)), default=0.0)
     between = between_fits(fit, trial_differences, best_gain, report)
     unstated_names = {difference.name for difference in differing if not difference.stated}
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
@@ -402,32 +458,32 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=differ)]
 
     def is_significant(hypothesis: LikelihoodRatio) -> bool:
-        return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
+        return hypothesis.sigma >= tests.family[hypothesis.names[-1]]
 
     # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
     # from it. Nothing is left to gain once the residuals of the best are no larger than the errors of the tracks and
     # trials scatter no more than careful work allows.
     for every in (False, True):
-        hypotheses = [*search.fit(all_of_them=every), *alone]
+        hypotheses = [*search.extend(every=every), *alone]
         best = best_of(hypotheses) if hypotheses else None
         if not every and nothing_rejects and (best is None or best.sigma < SEARCH_SIGMAS):
             return nothing_found()
-        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(best.fit))):
+        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(with_curves(best.fit)))):
             continue
         if is_significant(best):
             adequate, rejected, after = adequate_hypotheses(hypotheses, search)
             if after is not None:
-                return _rounds(tests, EffectSets(search, hypotheses), adequate, rejected, after)
+                return _rounds(search, hypotheses, adequate, rejected, after)
     if not tests.rejects_model and not tests.needs_search:
         return nothing_found()
 
     # Sets of effects.
-    hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in alone]
-    credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
+    credible = [hypothesis for hypothesis in search.of_size(1) if hypothesis.credible]
     if not credible or not is_significant(best_of(credible)):
         # A score that no refit confirms counts only if another test rejects the model too.
+        hypotheses = search.of_size(1)
         return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else ADEQUATE)
-    return _effect_set_rounds(tests, search, hypotheses)
+    return _effect_set_rounds(search)
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
@@ -437,39 +493,34 @@ def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
     return MISSING if len(adequate) == 1 else AMBIGUOUS
 
 
-def _effect_set_rounds(
-    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
-) -> list[SelectionStep]:
+def _effect_set_rounds(search: Search) -> list[SelectionStep]:
     """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`."""
-    singles = sorted(hypotheses, key=lambda single: -single.fit.log_likelihood)
-    sets = EffectSets(search, singles)
-    best_so_far, rejected = singles[0], dict[str, Remark]()
+    best_so_far, rejected = search.of_size(1)[0], dict[str, Remark]()
     for size in range(2, MAX_EFFECTS + 1):
         search.report(f"{size} effects together")
-        of_this_size = sets.grow(size)
+        of_this_size = search.grow(size)
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
-        adequate, rejected, after = adequate_hypotheses(of_this_size, search, sets)
+        adequate, rejected, after = adequate_hypotheses(of_this_size, search)
         if after is not None:
-            if sets.is_better(adequate[0]):
-                return _rounds(tests, sets, adequate, rejected, after)
+            if search.is_better(adequate[0]):
+                return _rounds(search, tuple(search.fitted.values()), adequate, rejected, after)
             rejected[adequate[0].label] = remark("gain_within_chance")
-        if not sets.is_better(of_this_size[0]):
+        if not search.is_better(of_this_size[0]):
             break
         best_so_far = of_this_size[0]
-    fitted = tuple(sets.fitted.values())
     # Of the best hypothesis of each size, why it is no explanation
     reasons = {
         best.label: rejected.get(best.label, MISFIT_REMAINS) if best.credible else best.reason
-        for best in (*singles[:1], *sets.of_size(2)[:1], best_so_far)
+        for best in (*search.of_size(1)[:1], *search.of_size(2)[:1], best_so_far)
     }
-    steps = sets.partial_steps()
-    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, rejected=tuple(reasons.items()), partial=steps)]
+    fitted, steps = tuple(search.fitted.values()), search.partial_steps()
+    return [SelectionStep(UNEXPLAINED, search.tests, (), fitted, tuple(reasons.items()), partial=steps)]
 
 
 def _rounds(
-    tests: MisfitTests,
-    sets: EffectSets,
+    search: Search,
+    fitted: Sequence[LikelihoodRatio],
     adequate: Sequence[LikelihoodRatio],
     rejected: dict[str, Remark],
     after: MisfitTests,
@@ -478,7 +529,7 @@ def _rounds(
     Physics comes before faults of the measurement, and within both the effect with the largest gain alone. A distortion
     of the picture whose leading term gains nearly everything comes first: the rest of the set may be its next term.
     """
-    fitted, reasons = tuple(sets.fitted.values()), tuple(rejected.items())
+    fitted, reasons = tuple(fitted), tuple(rejected.items())
     gains = {single.names[0]: single.delta_chi2 for single in fitted if len(single.names) == 1}
     kinds = {effect.name: effect.kind for hypothesis in adequate for effect in hypothesis.effects}
     best = adequate[0]
@@ -491,13 +542,13 @@ def _rounds(
     common = sorted(set.intersection(*(set(hypothesis.names) for hypothesis in adequate)), key=order)
     steps: list[SelectionStep] = []
     added: tuple[Effect, ...] = ()
-    round_tests, alternatives = tests, tuple(adequate)
+    round_tests, alternatives = search.tests, tuple(adequate)
     for name in common if len(adequate) > 1 else common[:-1]:
         verdict = ARTEFACT if kinds[name] == "measurement" else MISSING
         remaining = sorted((one for one in best.effects if one not in added), key=lambda one: one.name != name)
         together = likelihood_ratio(round_tests.fit, remaining, best.fit)
         note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
-        subset = sets.subset(best, (*added, remaining[0])) if added or verdict == MISSING else None
+        subset = search.subset(best, (*added, remaining[0])) if added or verdict == MISSING else None
         if added:
             alone = [] if subset is None else [likelihood_ratio(round_tests.fit, remaining[:1], subset.fit)]
             fitted, reasons = (*alone, together), ()
@@ -505,7 +556,7 @@ def _rounds(
         if verdict == ARTEFACT:
             return steps
         added = (*added, remaining[0])
-        round_tests = sets.search.tests_after(subset.fit if subset else best.fit)
+        round_tests = search.tests_after(subset.fit if subset else best.fit)
     if added:
         # What each set adds to the effects that are in the model already
         names_added = {effect.name for effect in added}

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
-    from vinetrack.diagnosis.force_laws import Law
-    from vinetrack.diagnosis.missing_force import LearnedForce
+    from vinetrack.diagnosis.missing_force import Law, LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.inference.fit_result import Fit
@@ -360,8 +359,8 @@ def drift_condition(column: str) -> tuple[str, str, float]:
     return column.replace("_", " "), "", 1.0
 
 
-def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: float = math.nan) -> str:
-    """Return how a parameter drifts: a row of the table, whether it rises steadily, the error of the sheet."""
+def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan) -> str:
+    """Return how a parameter drifts: a row of the table, and the error of the sheet."""
     against, start, stop = (row[name] for name in ("against", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
     change, error = 100 * row["change"], 100 * row["change_sigma"]
@@ -370,9 +369,8 @@ def drift_text(row: Mapping[str, Any], steady: bool = True, stated_sigma_Pa: flo
     if against == "sheet":
         return sentence("drifts_from_sheet", facts | {"sigma_Pa": stated_sigma_Pa})
     name, unit, times = drift_condition(against)
-    low, high = (start, stop) if steady else sorted((start, stop))
-    facts |= {"name": name, "low": f"{low * times:.3g} {unit}", "high": f"{high * times:.3g} {unit}"}
-    return sentence("rises_with" if steady else "is_not_constant", facts)
+    facts |= {"name": name, "low": f"{start * times:.3g} {unit}", "high": f"{stop * times:.3g} {unit}"}
+    return sentence("rises_with", facts)
 
 
 def _variables_text(name: str) -> str:

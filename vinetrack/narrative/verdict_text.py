@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
 from vinetrack.diagnosis.between_trials import BETWEEN, N_BY_VINE, ORDER_DRIFT, SPECIMEN
+from vinetrack.diagnosis.misfit_tests import slip_of
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -24,8 +25,6 @@ from vinetrack.diagnosis.result import (
     UNEXPLAINED,
     Confounder,
 )
-from vinetrack.diagnosis.score_test import slip_of
-from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
@@ -455,24 +454,17 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
 
 
 def _with_the_fault(step: SelectionStep) -> str:
-    """Give the parameters that are biased without the likeliest fault in the model, fitted with it and without it.
-    These are all parameters of effects added before, and those of the base model whose value with the fault lies
-    outside their 95 % interval without it; n comes first.
+    """Give the parameters whose value with the likeliest fault in the model lies outside their 95 % interval without
+    it, n first.
     """
-    fit, best = step.tests.fit, step.answer_set[0]
-    if best.names[-1] == N_BY_VINE:
-        return ""
-    before = {number.name: number for number in fit.numbers}
-    biased = []
-    for fitted in best.others:
-        without = before.get(fitted.name)
-        if without is None or not math.isfinite(fitted.sigma):
-            continue
-        within = not math.isfinite(without.sigma) or without.low <= fitted.value <= without.high
-        if fitted.key.split(".")[0] not in base_model() or not within:
-            biased.append(fitted)
-    biased.sort(key=lambda number: number.key != EXPONENT)
-    if not biased:
+    best, before = step.answer_set[0], {number.name: number for number in step.tests.fit.numbers}
+    biased = [
+        number
+        for number in sorted(best.others, key=lambda number: number.key != EXPONENT)
+        if (without := before.get(number.name)) and math.isfinite(without.sigma + number.sigma)
+        if not without.low <= number.value <= without.high
+    ]
+    if not biased or best.names[-1] == N_BY_VINE:
         return ""
     changes = [f"{estimate_text(number)} instead of {value_text(before[number.name])}" for number in biased]
     more = len(changes) - MOST_NAMED
