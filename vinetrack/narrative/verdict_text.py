@@ -446,7 +446,10 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
     for hypothesis in answers:
         parameters = {f"{effect.name}.{p.name}": p for effect in hypothesis.effects for p in effect.parameters}
         for entry in hypothesis.numbers:
-            if entry.key in parameters and (slip := slip_of(parameters[entry.key], entry.value, entry.sigma)):
+            parameter = parameters.get(entry.key)
+            low, high = (parameter and parameter.plausible) or (math.nan, math.nan)
+            # An ordinary error is likelier than a slip beside it.
+            if parameter and not low <= entry.value <= high and (slip := slip_of(parameter, entry.value, entry.sigma)):
                 effect_of_slip.setdefault(slip[1], entry.key.split(".")[0])
     return "".join(
         f" {name} has the size that results if {slip}: check that first." for slip, name in effect_of_slip.items()
