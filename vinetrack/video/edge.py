@@ -199,15 +199,19 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
     return np.arange(len(edge)) < first + int(np.argmax(edge[first:] > rest_px + 3 * state.blur + 1))
 
 
+def _near_start(edge: Floats) -> Bools:
+    """Frames in which a door may still hide the tip."""
+    return np.asarray(edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX)
+
+
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
     picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
     6); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
-    near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 1.6, 0.75: misfit above which, and amplitude below which, part of the edge is hidden (chosen)
-    unusual = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
+    unusual = _near_start(edge) & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
     covered = unusual & ((misfit > HIDDEN_MISFIT) | (amplitude < LEAST_AMPLITUDE))
     guess = np.where(unusual & (amplitude < 0.75), GUESSED_PX, 0.0)
     if covered.sum() > 1:
@@ -493,18 +497,19 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     contrast = np.abs(median_filter((state.appearance[0] - state.appearance[1]).mean(axis=0), 21, mode="nearest"))
     column = np.clip(np.rint(edge_now), tube.passed[0], tube.passed[1] - 1).astype(int)
     shared = 1.0 / np.maximum(contrast[column], 1.0)
-    in_mouth = find_mouth(strip, state, edge_now)
-    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, fit[:, 2] / usual, edge_now))
-    # Unsure is a poor fit: odd contrast, large misfit, hidden, uncertain.
+    in_mouth, misfit, ratio = find_mouth(strip, state, edge_now), fit[:, 2], fit[:, 2] / usual
+    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
+    slow = np.sqrt(unseen**2 + shared**2 + guess**2)
+    # Unsure is a poor fit: odd contrast, large misfit, near a door, uncertain.
     # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
-    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.3: misfit over the usual one above which a frame near the start is (chosen)
+    large = (misfit > 6.0 * max(float(np.nanmedian(misfit)), 0.3)) | (_near_start(edge_now) & (ratio > 1.3))
     # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
-    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | large
     # 1.0: standard error above which a point is doubtful, px (chosen)
-    uncertain = np.hypot(scatter, guess) > 1.0
+    uncertain = np.hypot(sigma, slow) > 1.0
     return Positions(
         strip=strip, edge_px=edge, sigma_px=np.hypot(sigma, dwell_error_px(edge_now, exposure)),
-        unsure=np.asarray(odd | uncertain), reach_px=3 * state.blur + 1,
-        slow_px=np.sqrt(unseen**2 + shared**2 + guess**2), exposure_frames=exposure,
+        unsure=np.asarray(odd | uncertain), reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure,
         width_px=tube.width_px, width_sigma_px=tube.width_sigma_px,
     )  # fmt: skip
