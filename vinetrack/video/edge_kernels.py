@@ -167,8 +167,8 @@ def fit_edges(
             moved = 0.0
             for band in range(len(bands)):
                 moved += (bands[band, 0] - ag * bands[band, 1] - al * bands[band, 2]) ** 2
-            # 0.2: least curvature of ln L, as a part of that without outliers (chosen)
-            curvature = max(info - less, 0.2 * info)
+            # 0.3: least curvature of ln L, as a part of that without outliers (chosen)
+            curvature = info * max(1 - less / yy, 0.3)
             out[i, 1] = math.sqrt(moved * len(bands) / max(len(bands) - 1, 1)) / curvature
             out[i, 2] = chi / max(used, 1.0)
             out[i, 5] = used
