@@ -333,7 +333,7 @@ def test_stated_errors_match_the_true_errors(changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
-    """By root mean squares over three draws: that of one is known to half. Bands twice as far apart count as outliers.
+    """By root mean squares over three draws: that of one is known to half. Bands further apart count as outliers.
 
     Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
     """
@@ -343,7 +343,7 @@ def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
     for seed in (333, 334, 335):
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, 4))
         # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
-        waves = [0.3 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
+        waves = [0.25 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
         luma = step_frames((true[:, None] + np.sum(waves, axis=0) * moves)[:, None, :])
         error, tracking, sigma, slow = step_errors(luma, 0.05, true)
         use = (frames > 25) & (frames < 95) & tracking.track.usable
