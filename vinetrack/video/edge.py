@@ -475,7 +475,7 @@ def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: fl
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
-BANDS_ERROR = 0.8  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)
+BANDS_ERROR = 0.9  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
