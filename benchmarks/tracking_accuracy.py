@@ -140,12 +140,12 @@ def measure(name: str, path: Path, truth: Truth, travel_ratio: float) -> tuple[R
 
 
 def along_axis(truth: Truth, tracking: Tracking) -> np.ndarray:
-    """True edge along the tracked axis, freed of the camera's shake: a line of even scale through the tip's places."""
+    """True edge along the tracked axis, freed of the camera's shake, which the places of the tip have."""
     tips = np.column_stack([truth.tip_x_px, truth.tip_y_px])
-    seen = np.isfinite(tips).all(axis=1) & np.isfinite(truth.lead_px) & truth.in_frame
-    design = np.column_stack([np.ones(seen.sum()), truth.lead_px[seen]])
-    line, *_ = np.linalg.lstsq(design, (tips[seen] - tracking.axis.from_px) @ tracking.axis.direction, rcond=None)
-    return line[0] + line[1] * truth.lead_px
+    seen = np.flatnonzero(np.isfinite(tips).all(axis=1) & np.isfinite(truth.lead_px) & truth.in_frame)
+    heading = tips[seen[-1]] - tips[seen[0]]
+    along = truth.lead_px * (heading @ tracking.axis.direction) / np.hypot(*heading)
+    return along + np.median((tips[seen] - tracking.axis.from_px) @ tracking.axis.direction - along[seen])
 
 
 def compare(name: str, tracking: Tracking, along_px: np.ndarray, moving: np.ndarray, spent: float) -> Row:

@@ -124,7 +124,7 @@ def test_camera_shake_is_removed_along_a_curve():
     assert error.std() < 0.4  # of a shake of 1.2 px, 0.9 px as a standard deviation
     assert np.abs(tracking.shake_px).max() > 0.8
     assert tracking.track.lead_position_systematic_m is not None
-    assert np.nanmin(tracking.track.lead_position_systematic_m[used]) > 0.1e-3
+    assert np.nanmin(tracking.track.lead_position_systematic_m[used]) > 0.05e-3
 
 
 @pytest.mark.slow

@@ -18,7 +18,6 @@ from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video import edge
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.edge import BANDS
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
@@ -132,7 +131,7 @@ def test_stated_errors_follow_the_roughness():
     rng = np.random.default_rng(213)
     noise = rng.normal(0, 0.5, 400)
     position = 0.02 * np.arange(400.0) ** 2 + noise
-    scaled = calibrated_sigma(position, np.full(400, 0.2), np.ones(400, dtype=bool))
+    scaled = calibrated_sigma(position, np.full(400, 0.2))
     assert scaled.mean() == pytest.approx(0.5, rel=0.15)
 
 
@@ -238,7 +237,6 @@ def test_a_tip_at_rest_in_sight_stays_ok(film):
 
 @pytest.mark.slow
 def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path):
-    """Rendered; what the door misplaces is the same in all bands of rows, so that they do not show it."""
     errors, stated = [], []
     for seed in (901, 903):
         path, truth = rendered_film(preset("downward"), "downward", seed, tmp_path, 6.0)
@@ -250,7 +248,7 @@ def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path):
         errors.append(error - error.mean())
         stated.append(np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[use])
     ratio = np.sqrt(np.mean(np.concatenate(errors) ** 2) / np.mean(np.concatenate(stated) ** 2))
-    assert 0.6 < ratio < 0.9
+    assert 0.67 < ratio < 1.2
 
 
 AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
@@ -335,7 +333,7 @@ def test_stated_errors_match_the_true_errors(changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
-    """By root mean squares over three draws: that of one, with four bands of which two mirror two, is known to half.
+    """By root mean squares over three draws: that of one is known to half. Bands further apart count as outliers.
 
     Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
     """
@@ -343,9 +341,9 @@ def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
     true, moves = grown_px(frames), (frames > 12)[:, None]
     found = []
     for seed in (333, 334, 335):
-        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, BANDS))
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, 4))
         # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
-        waves = [0.6 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
+        waves = [0.25 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
         luma = step_frames((true[:, None] + np.sum(waves, axis=0) * moves)[:, None, :])
         error, tracking, sigma, slow = step_errors(luma, 0.05, true)
         use = (frames > 25) & (frames < 95) & tracking.track.usable

@@ -31,7 +31,7 @@ def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tup
 
 def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: np.ndarray) -> np.ndarray:
     fixed = (np.zeros(16), LAG, 0.4, pictures, 0.15, 6.0, 12)
-    return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16), (0, 9))
+    return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16))
 
 
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])

@@ -285,16 +285,9 @@ def _longest_steady(
         near = int(np.argmin(worst))
         if worst[near] < least:
             least = worst[near]
-            if least > drift_limit:
-                why = f"changes by {100 * drift[near]:.2g} ± {196 * sigma[near]:.2g} % across it"
-            elif not long_enough[near]:
-                why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
-            else:
-                band = velocity[near : near + length] / mean[near]
-                why = f"contains speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
             nearest = (
-                f"no window is shown to be steady within ±{100 * drift_limit:g} %: the nearest,"
-                f" {length} of {n} moving points, {why}"
+                f"no window is shown to be steady within ±{100 * drift_limit:g} %: across the nearest, {length} of {n}"
+                f" moving points, speed changes by {100 * drift[near]:.2g} ± {196 * sigma[near]:.2g} %"
             )
     return None, nearest
 

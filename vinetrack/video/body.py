@@ -16,6 +16,7 @@ from vinetrack.core.records import Bools, Floats
 from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
+from vinetrack.video.point_quality import calibrated_sigma
 from vinetrack.video.strip import SLOW_PX, Look, Positions, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
@@ -71,8 +72,10 @@ def follow_body(look: Look) -> Positions | None:
         raise RecordingError(
             "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
         )
+    edge = np.where(unseen, np.nan, place[:, 0])
+    # 20.0: largest factor on an error whose likelihood does not know the interpolation between pixels (measured)
     return Positions(
-        strip=strip, edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error,
+        strip=strip, edge_px=edge, sigma_px=calibrated_sigma(edge, error, 20.0),
         unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
         exposure_frames=look.exposure_frames,
     )  # fmt: skip

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     EARLY_FIT_ROUNDS,
     FIT_ROUNDS,
-    OPTICAL_BLUR_PX,
     START_CLEARANCE_PX,
     EdgeState,
     blur_lengths,
@@ -42,21 +40,17 @@ from vinetrack.video.edge_state import (
     seen_exposure,
 )
 from vinetrack.video.frames import RecordingError
+from vinetrack.video.point_quality import calibrated_sigma
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip, snap_to_grid
+from vinetrack.video.strip import Look, Positions, Strip, cut_strip, snap_to_grid
 
 # ------------------------------------------------------------------------------
-# Repair of edge fits that break the motion, and errors of the edge by its bands.
+# Repair of edge fits that break the motion, and errors of the edge.
 #
 # The fit of every frame is compared with the motion; where it breaks it, the edge is searched again where the motion
-# leads. The edge is also fitted in bands of rows, each alone: their disagreement is an error that needs no model of
-# noise, since film, tail, glints and a swinging door touch one band and not another.
-#
-# Slow errors are those that neighbouring frames share, which neither roughness nor averaging reveals. Where film or
-# background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced by about G/C
-# pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge differently for some
-# frames, and their mean with them. Near the start a door or a mouth may hide the tip as well, and where a shaken
-# camera was stabilised the slow part of the shake stays.
+# leads. Its error is that of what its bands of rows would move it by, each alone: this needs no model of noise, since
+# film, tail, glints and a swinging door touch one band and not another. The roughness of the track tells which part of
+# it differs from frame to frame; the rest is slow. Near the start a door or a mouth may hide the tip as well.
 
 
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
@@ -120,65 +114,6 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
     inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
     inside &= np.isfinite(fits[:, 2])
     return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
-
-
-BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
-
-
-def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools) -> tuple[Floats, float]:
-    """Error of the edge from the disagreement of its bands, (n_frames,), px, zeros where there is one band only; and
-    the slow part of it. The weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a
-    band leads or lags by for long in the `core` frames is the shape of the tip, not an error.
-    """
-    neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
-    # The bands share the rows that are informative about the edge evenly, each of four rows or more (chosen).
-    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
-    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
-    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
-    limits = pairwise([0, *cuts.tolist(), strip.values.shape[1]])
-    placed = replace(state, edge=edge)
-    fits = [fit_edges(strip, placed, rows=(low, high)) for low, high in limits if high - low >= 4]
-    if len(fits) < 2:
-        return np.zeros(len(edge)), 0.0
-    edges, sigmas = (np.stack([fit[:, k] for fit in fits], axis=1) for k in (0, 1))
-    lead_px = np.nan_to_num(edges - edge[:, None])
-    # Slow error of the mean of bands, from the part of their disagreement that lasts over several frames: bands that
-    # disagree alike at lags of one and two frames (chosen) share a cause. Bands that mirror each other about the axis
-    # are averaged first, since a tip that tilts moves one ahead and the other behind and leaves the mean unchanged.
-    # What all frames share is the shape of the tip and is removed.
-    core_px = lead_px[core]
-    n_frames, n_bands = core_px.shape
-    away = core_px - core_px.mean(axis=1, keepdims=True)
-    away = away - np.median(away, axis=0)
-    pairs = (away + away[:, ::-1])[:, : n_bands // 2] / 2
-    pairs = pairs - pairs.mean(axis=1, keepdims=True)
-    # 4: fewest pairs of frames at a lag (chosen)
-    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in (1, 2) if n_frames - lag >= 4]
-    slow = 0.0
-    if n_bands >= 4 and products:  # the mean of a pair has half the variance of a band
-        slow = float(np.sqrt(max(2 * float(np.mean(products)) / (n_bands // 2 - 1), 0.0) / n_bands))
-    # 7, 50.0: fewest core frames nearby over which a median lead is taken, and the growth over which it is, px (chosen)
-    fewest, core_edge = min(7, int(core.sum())), edge[core]
-    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
-    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
-    offsets = np.empty((len(places), lead_px.shape[1]))
-    for i, place in enumerate(places):
-        distance = np.abs(core_edge - place)
-        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
-        offsets[i] = np.median(lead_px[core][near], axis=0)
-    lead_px = lead_px - offsets[frame_places]
-    weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
-    median_lead = np.median(lead_px, axis=1, keepdims=True)
-    # 2.0: deviation of a band, in median absolute deviations of those of its frame, at which it is clipped (chosen)
-    limit = 2.0 * np.median(np.abs(lead_px - median_lead), axis=1, keepdims=True) + 0.05
-    lead_px = median_lead + np.clip(lead_px - median_lead, -limit, limit)
-    total = weight.sum(axis=1)
-    mean = (weight * lead_px).sum(axis=1) / total
-    variance = (weight * (lead_px - mean[:, None]) ** 2).sum(axis=1) / (lead_px.shape[1] - 1) / total
-    padded = np.pad(variance, neighbours, mode="edge")
-    running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
-    # 1.27: ratio of mean to median of χ² with three degrees of freedom (derived)
-    return np.asarray(np.sqrt(1.27 * running_median)), slow
 
 
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
@@ -264,46 +199,27 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
     return np.arange(len(edge)) < first + int(np.argmax(edge[first:] > rest_px + 3 * state.blur + 1))
 
 
-def disturbed_start(strip: Strip, state: EdgeState) -> float:
-    """Share of the columns at the start that change before the edge reaches them: a door swings there."""
-    # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
-    door_columns, door_frames = (6, 10), 15
-    begin, columns = state.edge[0], strip.values.shape[2]
-    column_range = np.arange(int(begin) + door_columns[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
-    moving = np.flatnonzero(moving_frames(state.edge))
-    if len(column_range) < door_columns[1] or moving[0] < 2:
-        return 0.0
-    first = max(0, int(moving[0]) - door_frames)
-    rising = np.maximum.accumulate(state.edge)
-    contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
-    changed = 0
-    for column in column_range:
-        arrival = int(np.searchsorted(rising, column - 5.0))
-        frames = slice(first, max(arrival - 1, first + 1))
-        change = np.ptp(strip.brightness(frames, np.array([column])).mean(axis=(1, 2)))
-        # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
-        # and by so many grey levels (chosen)
-        changed += change > max(0.25 * contrast, 4.0)
-    return changed / len(column_range)
+def _near_start(edge: Floats) -> Bools:
+    """Frames in which a door may still hide the tip."""
+    return np.asarray(edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX)
 
 
-def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
-    """Enlarge the errors of frames in which a door still hides the tip. There the edge is a guess; where the picture
-    differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames, 6);
-    misfit_ratio, edge, added_px (n_frames,) → (n_frames,).
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
+    """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
+    picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
+    6); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
-    near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 1.6, 0.75: misfit above which, and amplitude below which, part of the edge is hidden (chosen)
-    unusual = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
+    unusual = _near_start(edge) & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
     covered = unusual & ((misfit > HIDDEN_MISFIT) | (amplitude < LEAST_AMPLITUDE))
-    guessed = unusual & (amplitude < 0.75)
+    guess = np.where(unusual & (amplitude < 0.75), GUESSED_PX, 0.0)
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
-        added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
-    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
+        guess[earlier] = ASTRAY_PX
+    return np.where(covered, NO_EDGE_PX, guess)
 
 
 # ------------------------------------------------------------------------------
@@ -368,9 +284,6 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
         step = max(step - fall, 0.0)
         path[t] = max(path[t + 1] - step, 0.0)
     return path, passed
-
-
-START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
 
 
 def follow_edge(look: Look) -> Positions | None:
@@ -562,68 +475,41 @@ def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: fl
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
+BANDS_ERROR = 0.9  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)
+
+
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
-    """Add to a converged fit the errors of bands, start and doors, and refer the edge to mid-exposure."""
+    """Add to a converged fit the errors of its bands and of hidden tips, and refer the edge to mid-exposure."""
     from scipy.ndimage import median_filter
 
-    core = core_frames(state, fit)
-    # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
-    # 100.0: upper limit of a frame's misfit relative to the median (chosen)
-    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0)
+    usual = max(float(np.nanmedian(fit[core_frames(state, fit), 2])), 1e-3)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
-    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * np.sqrt(misfit_ratio), ASTRAY_PX)
     # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
-    acceleration = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
-    edge = edge - np.clip(acceleration, -50, 50) * exposure**2 / 24
-    contrast = (state.appearance[0] - state.appearance[1]).mean(axis=0).astype(float)
-    contrast[: tube.passed[0]] = contrast[tube.passed[1] :] = np.nan
-    # 25.0: growth over which that error falls to 1/e (chosen)
-    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
-    near = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
-    # 0.5: error added if a door crosses the whole strip before growth, px, and in full from an excess of the mean
-    # misfit ratio near the start of 0.7 on (chosen)
-    door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
-    door = 0.5 * disturbed_start(strip, state) * door_weight
-    start_error = (START_ERROR_PX + door) * near_start
-    bands, shared = band_disagreement(strip, state, edge_now, core)
-    bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
-    # 3.0: factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
-    visible_error = np.hypot(bands * (3.0 if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
-    extra = hidden_errors(fit, misfit_ratio, edge_now, visible_error)
-    in_mouth = find_mouth(strip, state, edge_now)
-    extra = np.where(in_mouth, np.maximum(extra, NO_EDGE_PX), extra)
-    # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
-    hidden = (door * near_start > START_ERROR_PX) | in_mouth
-    # Unsure is a poor fit: odd contrast, large misfit, disagreeing bands, hidden, uncertain.
+    acceleration = np.gradient(np.gradient(fit[:, 0])) if len(fit) > 4 else np.zeros(len(fit))
+    edge = fit[:, 0] - np.clip(acceleration, -50, 50) * exposure**2 / 24
+    # 5: frames of whose errors the median is taken, so that few bands do not agree by chance (chosen)
+    scatter = np.nan_to_num(fit[:, 1], nan=ASTRAY_PX)
+    scatter = np.minimum(BANDS_ERROR * np.maximum(scatter, median_filter(scatter, 5, mode="nearest")), ASTRAY_PX)
+    sigma = calibrated_sigma(edge, scatter)
+    unseen = np.sqrt(np.maximum(scatter**2 - sigma**2, 0.0))
+    # 1.0, 21, 1.0: error of the pictures of film and background that all rows share, in grey levels of 255 (measured);
+    # columns over which the contrast is taken, px, and its least, grey levels (chosen)
+    contrast = np.abs(median_filter((state.appearance[0] - state.appearance[1]).mean(axis=0), 21, mode="nearest"))
+    column = np.clip(np.rint(edge_now), tube.passed[0], tube.passed[1] - 1).astype(int)
+    shared = 1.0 / np.maximum(contrast[column], 1.0)
+    in_mouth, misfit, ratio = find_mouth(strip, state, edge_now), fit[:, 2], fit[:, 2] / usual
+    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
+    slow = np.sqrt(unseen**2 + shared**2 + guess**2)
+    # Unsure is a poor fit: odd contrast, large misfit, near a door, uncertain.
     # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
-    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.3: misfit over the usual one above which a frame near the start is (chosen)
+    large = (misfit > 6.0 * max(float(np.nanmedian(misfit)), 0.3)) | (_near_start(edge_now) & (ratio > 1.3))
     # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
-    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
-    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
-    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
-    uncertain = (extra > 1.0) | (sigma > np.maximum(1.0, 5.0 * np.nanmedian(sigma)))
-    # What is added is split into a part that differs from frame to frame and one that neighbours share. Here the parts
-    # of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differ from
-    # frame to frame (measured, chosen):
-    start_part, guess_part = 0.4, math.sqrt(0.5)
-    near = np.sqrt(np.maximum(visible_error**2 - bands**2, 0.0))
-    guess = np.sqrt(np.maximum(extra**2 - visible_error**2, 0.0))
-    bands = np.sqrt(bands**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
-    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
-    # Slow error of any edge, and where film or background differ from their pictures: about 1/contrast
-    everywhere_px, finite = float(np.hypot(SLOW_PX, shared)), np.isfinite(contrast)
-    slow_px: Floats | float = everywhere_px
-    if finite.any():
-        columns = np.arange(len(contrast))
-        # 21: columns over which the contrast at an edge is taken, px (chosen)
-        level = np.interp(columns, columns[finite], np.abs(contrast[finite]))
-        local_contrast = np.interp(np.nan_to_num(edge_now), columns, median_filter(level, 21, mode="nearest"))
-        # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
-        # 1.0: least contrast, in grey levels (chosen)
-        slow_px = np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0))
-    slow = np.hypot(slow, slow_px)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | large
+    # 1.0: standard error above which a point is doubtful, px (chosen)
+    uncertain = np.hypot(sigma, slow) > 1.0
     return Positions(
-        strip=strip, edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden),
-        reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
-        bands_sigma_px=bands, width_px=tube.width_px, width_sigma_px=tube.width_sigma_px,
+        strip=strip, edge_px=edge, sigma_px=np.hypot(sigma, dwell_error_px(edge_now, exposure)),
+        unsure=np.asarray(odd | uncertain), reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure,
+        width_px=tube.width_px, width_sigma_px=tube.width_sigma_px,
     )  # fmt: skip

@@ -125,31 +125,24 @@ def core_frames(state: EdgeState, fit: Floats) -> Bools:
     return good if good.sum() >= 5 else clear
 
 
-def fit_edges(
-    strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS,
-    rows: tuple[int, int] | None = None,
-) -> Floats:  # fmt: skip
+def fit_edges(strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS) -> Floats:
     """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6), NaN
     in the other frames.
     """
     frames = np.flatnonzero(np.isfinite(state.edge) & chosen)
     out = np.full((len(state.edge), 6), np.nan)
-    out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds, rows)
+    out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds)
     return out
 
 
-def search_edges(
-    strip: Strip, state: EdgeState, frames: Indices, starts: Floats, rounds: int = FIT_ROUNDS,
-    rows: tuple[int, int] | None = None,
-) -> Floats:  # fmt: skip
+def search_edges(strip: Strip, state: EdgeState, frames: Indices, starts: Floats, rounds: int = FIT_ROUNDS) -> Floats:
     """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
     (n_searches,).
     """
     contrast_prior_sd = 0.15  # Prior deviation of relative amplitude and level of the contrast in one frame (chosen)
-    shading, rows = _padded_shading(state, MARGIN_PX), rows or (0, strip.values.shape[1])
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, starts, state.lengths, state.lag, state.blur, state.appearance,
-        contrast_prior_sd, MARGIN_PX, rounds, shading, frames, rows,
+        contrast_prior_sd, MARGIN_PX, rounds, _padded_shading(state, MARGIN_PX), frames,
     )  # fmt: skip
 
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
-FLOOR_PX = 0.04  # Standard error that no check shows
 
 REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
 
@@ -33,10 +32,10 @@ class PointQuality:
     without_edge: Bools
 
 
-def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, is_body: bool = False) -> Floats:
-    """Scale the stated errors to the roughness of the track. Fourth differences cancel any cubic motion and have the
-    variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard deviation; it
-    stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px, use (n_frames,) → (n_frames,).
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats, largest: float = 6.0) -> Floats:
+    """Scale the stated errors to the roughness of the track in motion. Fourth differences cancel any cubic motion and
+    have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard
+    deviation; it stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px (n_frames,) → (n_frames,).
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
@@ -44,13 +43,13 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, is_body: 
     windows = np.lib.stride_tricks.sliding_window_view
     difference = windows(edge_px, 5) @ weights
     expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
+    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
+    use = (np.gradient(edge_px) > 0.3) & np.isfinite(edge_px)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
     if inside.sum() < 8:
         return sigma_px
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    # 0.5, 6.0, 20.0: least and largest factor (chosen), the last for a body that is registered against itself, whose
-    # likelihood does not know the interpolation between pixels (measured)
-    return sigma_px * float(np.clip(factor, 0.5, 20.0 if is_body else 6.0))
+    return sigma_px * float(np.clip(factor, 0.5, largest))  # 0.5, 6.0: least and largest factor (chosen)
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:

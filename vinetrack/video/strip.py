@@ -55,9 +55,8 @@ class Strip:
 @dataclass(frozen=True, kw_only=True)
 class Positions:
     """Positions along a `strip` by frame, px, from any of the trackers; arrays of shape (n_frames,). `edge_px` is where
-    the edge, or the body, is at mid-exposure, NaN where it is not seen, `sigma_px` its standard error from the fit
-    alone; `extra_sigma_px` is what is added to that in all, `bands_sigma_px` the part of it that differs from frame to
-    frame, `slow_px` what neighbouring frames share. `reach_px` is how far from the end of the strip the last place is
+    the edge, or the body, is at mid-exposure, NaN where it is not seen, `sigma_px` its random error, `slow_px` what
+    neighbouring frames share. `reach_px` is how far from the end of the strip the last place is
     that can be seen; `end` the frame in which a body turns back; `width_px` that of a tube, with its standard error.
     """
 
@@ -68,8 +67,6 @@ class Positions:
     reach_px: float
     slow_px: Floats | float
     exposure_frames: float = math.nan
-    extra_sigma_px: Floats | float = 0.0
-    bands_sigma_px: Floats | float = 0.0
     end: int | None = None
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan

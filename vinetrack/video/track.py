@@ -21,7 +21,6 @@ from vinetrack.video.frames import Frames, RecordingError, inspect_recording, od
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
-    FLOOR_PX,
     LOST_SIGMA_PX,
     Ending,
     PointQuality,
@@ -58,10 +57,11 @@ def follow_arrival(look: Look) -> Positions:
     path = dividing_path(evidence)
     edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
     smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    # 0.8, 1.0: random and slow error of an arrival (measured)
+    # 0.8, 1.0: random error before it is scaled to the roughness, and slow error, of an arrival (measured)
     return Positions(
-        strip=strip, edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool),
-        reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
+        strip=strip, edge_px=smoothed, sigma_px=calibrated_sigma(smoothed, np.full(len(edge), 0.8)),
+        unsure=np.zeros(len(edge), dtype=bool), reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames,
+        is_edge=False,
     )  # fmt: skip
 
 
@@ -123,7 +123,7 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
-STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the still background (measured)
+STABILISED_PX = 0.05  # Error left after a shaken camera was stabilised on the still background (measured)
 
 
 @dataclass(frozen=True)
@@ -180,16 +180,11 @@ def track_pixels(
         followed = follow(Look(luma, axis, small, trial.travel_ratio, exposure_s * capture_fps))
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
-    # Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
-    # The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
-    # larger one counts.
-    strip, edge_px = followed.strip, followed.edge_px
-    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
-    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
-    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
-    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
-    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
-    total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
+    strip, random_px = followed.strip, followed.sigma_px
+    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
+    shared_px = STABILISED_PX if strip.stabilised else 0.0, 0.04 * strip.axis.total_turn_rad
+    slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), np.hypot(*shared_px))
+    total_px = np.hypot(random_px, slow_px)
     end_px = strip.axis.length_px - followed.reach_px
     quality = assess_points(followed.edge_px, total_px, number, unsure=followed.unsure, end_px=end_px)
     if quality.last_moving < 0:
@@ -198,11 +193,6 @@ def track_pixels(
             what = "something moves, but its edge is too vague to be followed"
             raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
         raise RecordingError("nothing moves along the axis", "check the recording, or give the axis", name)
-    # Random, with the disagreement of bands; and shared by neighbouring frames: of edge, stabilisation and path.
-    random_px = np.maximum(random_px, followed.bands_sigma_px)
-    slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), STABILISED_PX if strip.stabilised else 0.0)
-    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
-    slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
     notes, ending = _notes(frames, number, luma, trial, followed, quality, axis_given)
     notes += left_out
