@@ -387,7 +387,8 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     relative_time = time_from_point / width[:, None]
     powers = relative_time[..., None] ** np.arange(4)
     y = position_m[places] - position_m[:, None]
-    smallest_scale = np.maximum(noise_m, 1e-9 * np.ptp(position_m))
+    # 1e-12: m, of a track that stands still to the last digit
+    smallest_scale = np.maximum(noise_m, max(1e-9 * float(np.ptp(position_m)), 1e-12))
     weight = np.ones_like(y)
     for turn in range(10):
         coefficients = _normal_solution(powers, weight, np.einsum("wip,wi->wp", powers, weight * y))
