@@ -49,15 +49,7 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    measured_trials,
-    read_diagnosis,
-    read_json,
-    read_result,
-    table_of,
-)
+from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
@@ -173,8 +165,8 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
         return diagnosis
-    told = set(contradictions.values())
-    notes = (*contradictions.values(), *(note for note in diagnosis.notes if str(note) not in told))
+    others = (note for note in diagnosis.notes if str(note) not in contradictions.values())
+    notes = (*contradictions.values(), *others)
     contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes)
     return replace(contradicted, explanation=f"{verdict_sentence(contradicted)} {diagnosis.explanation}")
 
@@ -197,9 +189,9 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
-    tables = diagnosis_tables(diagnosis) | {"steps.csv": _all_steps(results, ladder)}
+    tables = {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
+    tables |= {**diagnosis_tables(diagnosis), "steps.csv": _all_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
-    tables |= {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
         tables["damping_laws.csv"] = _laws(diagnosis, pairs, settings)
@@ -219,10 +211,11 @@ def _all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
+    from vinetrack.results.folder_layout import read_result
+
     former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
-    for k, row in enumerate(former.to_dict("records") if len(ladder) else ()):
-        now = ladder.iloc[0]
-        if row["model"] == now["model"] and np.isclose(row["rms_in_sample_m"], now["rms_in_sample_m"], 1e-3, 0.0):
+    for k, row in enumerate(former.itertuples() if len(ladder) else ()):
+        if row.model == ladder["model"][0] and np.isclose(row.rms_in_sample_m, ladder["rms_in_sample_m"][0], 1e-3, 0):
             return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
     return ladder
 
@@ -268,8 +261,8 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> tuple[list[str], Any]:
     """Add an effect to the model and refit. Returns lines, and the ladder of errors of both models."""
-    pairs, _ = measured_trials(experiment, Results(folder))
-    before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
+    tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))[0]}
+    before, after, table = add(experiment, tracks, name, report)
     return added_in_words(before, after, table, moved((before, after), ("", name))), table.to_dict("records")
 
 
@@ -286,8 +279,7 @@ def propose_effect(
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
-    pairs, _ = measured_trials(experiment, results)
-    proposal = propose(model, pairs, report)
+    proposal = propose(model, measured_trials(experiment, results)[0], report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}
