@@ -44,6 +44,7 @@ CAPTION = (
 )
 FIGURES = {"tutorial_strip": "strip_d24_30kPa_1", "tutorial_before_after": "before_after", "verdict_ladder": "ladder"}
 SEED, STIFFNESS_N_M = 41, 0.4
+GALLERY = (("null:white", 52001), ("inlet_loss", 40000), ("time_base", 52001), ("outsider:cubic", 52001))
 
 
 def block(page: str, language: str) -> str:
@@ -151,6 +152,30 @@ def save_pictures(results: Path, scratch: Path) -> None:
     save_picture((scratch / "report.png").read_bytes(), "report")
 
 
+def save_gallery(results: Path, scratch: Path) -> None:
+    """The head of the demonstration's report, and of one for each other verdict, of campaigns of `hidden`."""
+    from chrome import Chrome
+    from commanded import succeed
+    from hidden import make, write_folder
+    from PIL import Image
+
+    folders, heads = [results], []
+    for kind, seed in GALLERY:
+        name = kind.replace(":", "_")
+        write_folder(make(kind, seed), scratch / name)
+        succeed("run", scratch / name, "--results", scratch / "gallery")
+        folders.append(scratch / "gallery" / name)
+    with Chrome(scratch / "heads", 1200, 620) as browser:
+        for k, folder in enumerate(folders):
+            browser.open((folder / "report.html").resolve().as_uri())
+            browser.picture(scratch / f"head_{k}.png")
+            heads.append(Image.open(scratch / f"head_{k}.png").convert("RGB"))
+    whole = Image.new("RGB", (1200, sum(head.height for head in heads)))
+    for k, head in enumerate(heads):
+        whole.paste(head, (0, sum(one.height for one in heads[:k])))
+    whole.resize((800, whole.height * 800 // 1200)).save(DOCS / "verdict_gallery.webp", quality=40, method=6)
+
+
 def save_explorer(results: Path, scratch: Path) -> None:
     """The explorer once reservoir depletion was ticked and refitted, and the numbers of its caption."""
     from chrome import Chrome
@@ -199,6 +224,7 @@ def main() -> None:
             stage_own_effect(scratch / "my_experiment")
         if not asked.no_pictures:
             save_pictures(results, scratch)
+            save_gallery(results, scratch)
         os.chdir(scratch)
         if not asked.no_pictures:
             save_explorer(Path("results/demo"), scratch)
