@@ -269,6 +269,11 @@ def solve(
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
+        if at_corner and not predictor.is_central:
+            # A step did not do what it promised: one-sided differences may promise what second derivatives mimic.
+            predictor.is_central, at_corner, damping = True, False, 0.0
+            columns, cross_products = _linearise(predictor, state)
+            continue
         small_step = predicted_decrease < least_decrease or at_corner
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
@@ -289,7 +294,9 @@ def solve(
         if accepted is None:
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
             # step should gain much, it is no minimum, but nothing more can be done.
-            if variances_moved < CONVERGED_VARIANCES:
+            if not predictor.is_central:
+                at_corner = True
+            elif variances_moved < CONVERGED_VARIANCES:
                 converged = predicted_decrease < far_decrease
                 break
             continue

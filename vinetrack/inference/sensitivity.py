@@ -216,6 +216,7 @@ class Predictor:
         self.with_trace = np.array([trial_data.trace is not None for trial_data in data], dtype=bool)
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
+        self.is_central = False  # whether differences are central, of twice as many simulations
 
     def run(self, jobs: Jobs, times_s: Sequence[Floats] | None = None, model: Model | None = None) -> list[Trajectory]:
         """Simulate at the times of each job's trial, or at `times_s`, by the model of the fit or another one."""
@@ -301,7 +302,8 @@ class Predictor:
         (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
         unperturbed = self.jobs(theta, trial_effects)
-        perturbations = list(self._perturbations(unperturbed, theta, trial_effects, trial_effects_only))
+        sides, at = ((1, -1) if self.is_central else (1,)), (unperturbed, theta, trial_effects, trial_effects_only)
+        perturbations = [one for side in sides for one in self._perturbations(*at, side)]
         motions = self._simulated(Jobs.concatenated([unperturbed, *(jobs for _, _, jobs in perturbations)]))
         count = len(self.data)
         rows = motions.rows(0, count)
@@ -315,7 +317,7 @@ class Predictor:
             points = self._points_of(perturbed.trial)
             change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
             self._clip_after_end(change, motions, perturbed.trial, jobs)
-            table[points, place] = change / np.repeat(steps, np.diff(self.starts)[perturbed.trial])
+            table[points, place] += change / np.repeat(steps, np.diff(self.starts)[perturbed.trial]) / len(sides)
         if DAMPING in self.layout.keys:
             # The sensitivity to ln B of the vine is also that to the deviation of ln B.
             points = self._points_of(np.flatnonzero(self.has_damping_deviation))
@@ -367,28 +369,31 @@ class Predictor:
         )
 
     def _perturbations(
-        self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
+        self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool, side: int
     ) -> Iterator[tuple[int, Floats, Jobs]]:
-        """For each column to be differenced: its place, the step of each trial, and the perturbed jobs."""
-        damping_step = 1e-3  # Relative step of B (derived)
+        """For each column to be differenced: its place, the step of each trial to this side (within the bounds), and
+        the perturbed jobs.
+        """
+        damping_step = 1e-3 * side  # Relative step of B (derived)
         if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
-            steps, perturbed = RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed[shifted_trials]
+            steps, perturbed = side * RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed[shifted_trials]
             yield RELEASE, steps, replace(perturbed, release_s=perturbed.release_s + steps)
         if len(pressure_trials := np.flatnonzero(self.has_pressure_deviation)):
-            steps, perturbed = self.pressure_step[pressure_trials], unperturbed[pressure_trials]
+            steps, perturbed = side * self.pressure_step[pressure_trials], unperturbed[pressure_trials]
             yield PRESSURE, steps, replace(perturbed, pressure_deviation=perturbed.pressure_deviation + steps)
         if DAMPING not in self.layout.keys and len(damping_trials := np.flatnonzero(self.has_damping_deviation)):
             perturbed = unperturbed[damping_trials]
             perturbed.row[:, self.damping_column] *= np.exp(damping_step)
             yield DAMPING_DEVIATION, np.full(damping_trials.size, damping_step), perturbed
-        upper = self.layout.bounds[1]
+        lower, upper = self.layout.bounds
         for column, key in enumerate(self.layout.keys):
             trials_of_key = np.flatnonzero(self.layout.index[:, column] >= 0)
             if not trials_of_key.size or (trial_effects_only and key != DAMPING) or self.layout.term(key) is not None:
                 continue
             places = self.layout.index[trials_of_key, column]
-            step = float(self.steps[column])
-            steps = np.where(theta[places] + step > upper[places], -step, step)
+            step = side * float(self.steps[column])
+            there = theta[places] + step
+            steps = np.where((there > upper[places]) | (there < lower[places]), -step, step)
             perturbed_theta = theta.copy()
             perturbed_theta[places] = theta[places] + steps
             perturbed = self.jobs(perturbed_theta, trial_effects)[trials_of_key]

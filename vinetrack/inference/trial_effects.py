@@ -114,6 +114,7 @@ def subset(
     )
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
     smaller.pressure_step, smaller.steps = predictor.pressure_step[rows], predictor.steps[columns]
+    smaller.is_central = predictor.is_central
     smaller.has_pressure_deviation = predictor.has_pressure_deviation[rows]
     smaller.has_damping_deviation = predictor.has_damping_deviation[rows]
     by_parameter = "prior_mean prior_precision lower upper free random"
