@@ -4,6 +4,7 @@ import base64
 import contextlib
 import http.client
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,14 @@ def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_the
     expected = {(draft.SHARED_ROW, "pressure_kPa"): "1000", (0, "pressure_kPa"): "24"}
     assert changed("1000\n24\n", draft.SHARED_ROW, "pressure_kPa") == expected
     assert changed("pressure\n24", 1, "diameter_mm") == {(1, "pressure_kPa"): "24"}
+
+
+def test_sentences_above_the_table_of_notes_are_left_out_and_short_headings_known():
+    prose = "bench, sat 28 nov\nno payload yet, pressure from the big regulator\n"
+    table = "clip    psi   payload_g\nd99_1   9    1\nlate   5.3   5\nd15_24kPa_1   3.5  0\nd15_30kPa_1   4.5   20"
+    for text in (prose + table, prose + re.sub(" {2,}", "\t", table), prose + table.replace("psi", "P (psi)")):
+        assert changed(text) == EXPECTED
+        assert notes(text) == 2
 
 
 def test_what_matches_nothing_is_named_and_changes_nothing():

@@ -315,12 +315,24 @@ def place_block(
     (row of the sheet or `SHARED_ROW`, column, text), and what was left out, in sentences. Without a header its columns
     follow the one pasted into, and without names its rows the row pasted into.
     """
-    block = read_block(text)
     placed: list[tuple[int | str, str, str]] = []
     notes: list[str] = []
     words, row_named = _header_words(columns), _rows_by_name(rows)
+
+    def column_named(word: str) -> str:
+        return words.get(re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_"), "")
+
+    # Notes may have sentences above their table, which begins with its header or the line of the first recording.
+    lines = [line for line in text.splitlines() if line.strip()]
+    named = (i for i, line in enumerate(lines) if any(f"_{name}_" in f"_{_plain(line)}_" for name in row_named))
+    table = next(named, 0)
+    known = [sum(bool(column_named(word)) for word in re.split(r"[\s,;|]+", line)) for line in lines[:table]]
+    table = table - 1 - known[::-1].index(max(known)) if any(known) else table
+    if table:
+        notes.append(f"{table} line{'s'[: table > 1]} above the table: left out.")
+    block = read_block("\n".join(lines[table:]))
     first = block[0] if block else []
-    header = [words.get(re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_"), "") for word in first]
+    header = [column_named(word) for word in first]
     if any(header) and not any(_NUMBER.fullmatch(word) for word in first):
         unknown = [word for word, name in zip(first, header, strict=True) if word and not name]
         notes += [f"No column is named “{word}”: left out." for word in unknown]
@@ -366,6 +378,14 @@ def _header_words(columns: Sequence[str]) -> dict[str, str]:
     words: dict[str, str] = {}
     for name in (*COLUMNS, *columns):
         words |= {written.lower(): written for written in (*other_units(name), name)} | {quantity(name).lower(): name}
+    short = {"film": "thickness", "wall": "thickness", "p": "pressure", "dia": "diameter", "l": "length"}
+    words |= {
+        word.replace(name, other, 1): column
+        for other, name in short.items()
+        for word, column in list(words.items())
+        if word == name or word.startswith(f"{name}_")
+    }
+    words |= {unit: words[f"pressure_{unit}"] for unit in ("psi", "kpa", "bar") if f"pressure_{unit}" in words}
     names = "trial video clip film recording file file_name filename name movie"
     return words | dict.fromkeys(names.split(), "trial")
 
