@@ -126,6 +126,22 @@ def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all
         assert abs(number.value - other.value) < 0.05 * other.sigma
 
 
+@pytest.mark.parametrize("is_central", [False, True])
+def test_the_column_of_a_release_is_a_difference_where_positions_are_transformed(campaign, is_central):
+    fit = campaign[0]
+    found = vt.refit(fit, fit.model + "length_scale", start={"length_scale.eps": 0.01}, most_iterations=1)
+    predictor, state = found.predictor, found.solution.state
+    predictor.is_central = is_central
+    assert not predictor.release_is_shift.any()
+    columns = predictor.linearise(state.theta, state.trial_effects)
+    moved = state.trial_effects.copy()
+    moved[:, 0] += 1e-3 * predictor.frames_s
+    before, after = (predictor.residuals(state.theta, own) for own in (state.trial_effects, moved))
+    for of_trial, one, other, frame_s in zip(columns, before, after, predictor.frames_s, strict=True):
+        slope = (one - other) / (1e-3 * frame_s)
+        assert np.median(np.abs(of_trial[:, 0] - slope)) < 0.02 * np.max(np.abs(slope))
+
+
 def test_central_differences_keep_apart_what_acts_in_the_same_way(campaign):
     """Pressure and yield pressure act by their difference alone: one-sided differences miss that by a thousandth, which
     is ten times the noise of a precise track, and promised gains that no step could keep.

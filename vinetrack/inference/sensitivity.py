@@ -310,6 +310,7 @@ class Predictor:
         table = np.zeros((rows.shape[0], N_TRIAL_EFFECTS + len(self.layout.keys) + 1))
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
+        table[self._points_of(np.flatnonzero(~self.release_is_shift)), RELEASE] = 0.0  # differenced below
         table[:, -1] = self._residuals(rows[:, OBSERVED], trial_effects)
         first = count
         for place, steps, perturbed in perturbations:
