@@ -44,7 +44,7 @@ CAPTION = (
 )
 FIGURES = {"tutorial_strip": "strip_d24_30kPa_1", "tutorial_before_after": "before_after", "verdict_ladder": "ladder"}
 SEED, STIFFNESS_N_M = 41, 0.4
-GALLERY = (("null:white", 52001), ("inlet_loss", 40000), ("length_scale", 40000), ("outsider:growing_friction", 40000))
+GALLERY = (("null:white", 52001), ("inlet_loss", 40000), ("payload_mass", 40000), ("outsider:growing_friction", 40000))
 
 
 def block(page: str, language: str) -> str:
