@@ -385,7 +385,7 @@ def _header_words(columns: Sequence[str]) -> dict[str, str]:
         for word, column in list(words.items())
         if word == name or word.startswith(f"{name}_")
     }
-    words |= {unit: words[f"pressure_{unit}"] for unit in ("psi", "kpa", "bar") if f"pressure_{unit}" in words}
+    words |= {unit: column for unit in ("psi", "kpa", "bar") if (column := words.get(f"pressure_{unit}"))}
     names = "trial video clip film recording file file_name filename name movie"
     return words | dict.fromkeys(names.split(), "trial")
 
