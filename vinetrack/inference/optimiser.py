@@ -269,8 +269,10 @@ def solve(
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
-        if at_corner and not predictor.is_central:
-            # A step did not do what it promised: one-sided differences may promise what second derivatives mimic.
+        # A step did not do what it promised: one-sided differences may promise what second derivatives mimic.
+        # 10.0: promised decrease of −2 ln L from which differences become central; at corners it is less (chosen)
+        one_sided = predicted_decrease > 10.0 and not predictor.is_central
+        if at_corner and one_sided:
             predictor.is_central, at_corner, damping = True, False, 0.0
             columns, cross_products = _linearise(predictor, state)
             continue
@@ -294,7 +296,7 @@ def solve(
         if accepted is None:
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
             # step should gain much, it is no minimum, but nothing more can be done.
-            if not predictor.is_central:
+            if one_sided:
                 at_corner = True
             elif variances_moved < CONVERGED_VARIANCES:
                 converged = predicted_decrease < far_decrease
