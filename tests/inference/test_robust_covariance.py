@@ -128,7 +128,7 @@ def test_errors_shared_by_a_group_enter_the_covariance():
     draw, groups, seen = np.random.default_rng(7), [f"s{i % 12:02}" for i in range(48)], []
     for _ in range(400):
         single = np.tile(draw.standard_normal((12, 1)), (4, 1)) + 0.1 * draw.standard_normal((48, 1))
-        seen.append(errors.group_scatter(single - single.mean(axis=0), groups, 1)[0])
+        seen.append(errors.cluster_variance(single, 1, groups)[0])
     # 12 groups of 4 with a shared error of variance 1 and single ones of 0.01: 12 · 16 + 48 · 0.01.
     assert abs(np.mean(seen) / 192.5 - 1) < 0.05
 
@@ -153,7 +153,7 @@ def test_the_scatter_of_scores_is_not_less_for_the_numbers_that_were_fitted_to_t
     left = np.eye(24) - columns @ np.linalg.pinv(columns)
     for _ in range(500):
         single = (left @ draw.standard_normal(24))[:, None]
-        seen.append(errors.group_scatter(single, range(24), 10)[0])
+        seen.append(errors.cluster_variance(single, 10, [str(k) for k in range(24)])[0])
     assert np.mean(seen) == pytest.approx(24, rel=0.06)
 
 

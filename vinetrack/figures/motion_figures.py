@@ -36,10 +36,11 @@ def draw_trial_motion(
     if kinematics.empty:
         return None
     unusable, by_hand = with_flag(track["flag"], *UNUSABLE_FLAGS), with_flag(track["flag"], "corrected")
-    counts = f"{len(kinematics)} points"
+    step = max(len(track) // 40, 1)  # chosen: few points, since the curve goes through them, keep the figure small
+    counts = f"{len(kinematics)} points" + (f", one in {step} drawn" if step > 1 else "")
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
-    kinematics = st.thinned(kinematics, 60)
+    kinematics = st.thinned(kinematics, 120)
     # From below, in: counts and time scale, a bar for each window, speed, position, title; to the right a second scale
     strip_from, strip_in, speed_in, lead_in, title_in = 0.86, 0.24 * max(len(windows), 1), 2.1, 1.75, 0.38
     left, wide_in, right_in, gap_in = 0.9, 5.5, 0.8, 0.12
@@ -57,7 +58,6 @@ def draw_trial_motion(
     speed = st.Panel(sheet, (left, speed_from, wide_in, speed_in), over, _speed_limits(speed_m_s, two_sigma_m_s))
     strip = st.Panel(sheet, (left, strip_from, wide_in, strip_in), over, (len(windows) - 0.4, -0.6))
 
-    step = max(len(track) // 40, 1)  # chosen: few points, since the curve goes through them, keep the figure small
     lead.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
     lead.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
     lead.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)

@@ -409,20 +409,13 @@ def _summed_over(groups: Sequence[Hashable], single: Floats) -> Floats:
 
 def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floats:
     """Variance of sums over trials, from the scatter of single trials or, where that is larger, of their clusters
-    (`coarsest_groups`); 0 where trials are too few. Shapes: single (n_trials, n) → (n,).
+    (`coarsest_groups`), corrected for few groups by G/(G − 1) · (N − 1)/(N − p): CR1 of Cameron & Miller, Journal of
+    Human Resources 50, 317 (2015); 0 where trials are too few. Shapes: single (n_trials, n) → (n,).
     """
     trials = len(single)
     if trials < FEWEST_CLUSTERS:
         return np.zeros(single.shape[1])
-    single = single - single.mean(axis=0)
-    return np.max([group_scatter(single, each, fitted) for each in (range(trials), groups)], axis=0)
-
-
-def group_scatter(single: Floats, groups: Sequence[Hashable], fitted: float) -> Floats:
-    """Variance of sums over trials from the scatter of those over groups, corrected for few groups by
-    G/(G − 1) · (N − 1)/(N − p): CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015). Shapes: single
-    (n_trials, n) → (n,).
-    """
-    sums, trials = _summed_over(groups, single), len(single)
-    factor = len(sums) / max(len(sums) - 1, 1) * (trials - 1) / max(trials - fitted, 1)
-    return np.asarray(np.sum(sums**2, axis=0) * factor)
+    sums = [_summed_over(each, single - single.mean(axis=0)) for each in (range(trials), groups)]
+    return np.max([np.sum(one**2, axis=0) * len(one) / max(len(one) - 1, 1) for one in sums], axis=0) * (
+        (trials - 1) / max(trials - fitted, 1)
+    )

@@ -281,10 +281,11 @@ def solve(
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (small_step or iteration % 5 == 0):
             relocated = releases.likelier(state, residuals_in(columns))
-            searches_left -= 1 if relocated is not None else 4 * small_step
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
+                searches_left -= 1
                 continue
+            searches_left = 0 if small_step else searches_left
         if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
             converged = True
             break

@@ -49,6 +49,7 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
+from vinetrack.results.diagnosis_tables import all_steps
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
@@ -190,7 +191,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
     tables = {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
-    tables |= {**diagnosis_tables(diagnosis), "steps.csv": _all_steps(results, ladder)}
+    tables |= {**diagnosis_tables(diagnosis), "steps.csv": all_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
@@ -203,21 +204,6 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     write_csv(results.ladder, ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
-
-
-def _all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
-    """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
-    if its error there is the same, so that it is of the same trials.
-    """
-    import pandas as pd
-
-    from vinetrack.results.folder_layout import read_result
-
-    former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
-    for k, row in enumerate(former.itertuples() if len(ladder) else ()):
-        if row.model == ladder["model"][0] and np.isclose(row.rms_in_sample_m, ladder["rms_in_sample_m"][0], 1e-3, 0):
-            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
-    return ladder
 
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:

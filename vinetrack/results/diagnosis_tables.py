@@ -116,3 +116,16 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
     columns = ["condition", *names, *parts, "misfit_m", "scatter_m"]
     place = {condition: i for i, condition in enumerate(labels)}
     return table.dropna(subset=list(names))[columns].sort_values("condition", key=lambda c: c.map(place), kind="stable")
+
+
+def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+    """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
+    if its error there is the same, so that it is of the same trials.
+    """
+    import pandas as pd
+
+    former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
+    for k, row in enumerate(former.itertuples() if len(ladder) else ()):
+        if row.model == ladder["model"][0] and np.isclose(row.rms_in_sample_m, ladder["rms_in_sample_m"][0], 1e-3, 0):
+            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
+    return ladder
