@@ -119,7 +119,7 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
     assert [(one.group, one.other_groups) for one in misfit_tests.shapes_of(FILM, TRIALS)] == told
     assert not any(shape.group for shape in misfit_tests.shapes_of(catalogue()["air_drag"], TRIALS))
     known = [replace(trial, day=str(1 + k % 2)) for k, trial in enumerate(TRIALS)]
-    for of, days in ((known, ["day 1", "day 2"]), ([known[0], replace(known[1], day="")], []), (known[:1], [])):
+    for of, days in ((known, ["day 1", "day 2"]), ([known[0], replace(known[1], day="")], ["a", "b"]), (known[:1], [])):
         assert [shape.group for shape in misfit_tests.shapes_of(catalogue()["time_base"], of)] == ["", *days]
         assert groups_of(of, "day") == (days or [""] * len(of))
     assert group_names([replace(known[0], day=day) for day in ("10", "2", "2")], "day") == ["day 2", "day 10"]

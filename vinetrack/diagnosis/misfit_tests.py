@@ -32,7 +32,7 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.errors import cluster_variance, coarsest_groups
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import Fit, group_names
+from vinetrack.inference.fit_result import Fit, group_names, groups_of
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
@@ -281,8 +281,8 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
     """Change of the positions of every trial with the step of the shape added, m."""
     predictor, state = fit.predictor, fit.solution.state
     jobs = predictor.jobs(state.theta, state.trial_effects).with_effect(shape.values)
-    shared = shape.size.shared if shape.group else ""
-    affected = [i for i, trial in enumerate(fit.trials) if trial.trial.group(shared) == shape.group]
+    groups = groups_of([trial.trial for trial in fit.trials], shape.size.shared) if shape.group else []
+    affected = [i for i in range(len(fit.trials)) if not shape.group or groups[i] == shape.group]
     changed = predictor.run(jobs[affected], model=predictor.layout.model + shape.effect)
     change = [np.zeros(before.time_s.size) for before in baseline]
     for i, trajectory in zip(affected, changed, strict=True):

@@ -141,7 +141,7 @@ class Model(Printed):
         return replace(self, values={**self.values, **values})
 
     def parameters_for(self, vine: str, day: str = "") -> Floats:
-        """Values of all parameters for the trials of one vine, and of one day. Returns SI, in the order of
+        """Values of all parameters for the trials of one vine, and of one day or set-up. Returns SI, in the order of
         `parameter_names`. Shape (n_parameters,).
         """
         numbers = []
@@ -149,7 +149,7 @@ class Model(Printed):
             for parameter in effect.parameters:
                 value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
                 if isinstance(value, Mapping) and parameter.shared == "day":
-                    value = value.get(day, parameter.zero)
+                    value = value.get(day, value.get(vine, parameter.zero))
                 elif isinstance(value, Mapping):
                     if vine not in value:
                         raise EffectError(f"{effect.name}.{parameter.name} has no value for the vine {vine!r}.")

@@ -27,6 +27,7 @@ PARAMETERS = (
         "1",
         0.02,
         bounds=(-0.6, 1.5),
+        shared="vine",
         plausible=(-0.05, 0.05),
         meaning="relative error of D",
         slips=(

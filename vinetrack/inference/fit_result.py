@@ -239,11 +239,12 @@ def make_layout(
 
 def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
     """For each trial the name of the group with which it shares a parameter; blank if all trials share it. With `day`,
-    all trials share it unless the sheet states several days, and one for every trial.
+    it is the vine unless the sheet states several days, and one for every trial: a camera is set up anew for either.
     """
     groups = [trial.group(shared) for trial in trials]
     if shared == "day" and (not all(groups) or len(set(groups)) == 1):
-        return [""] * len(groups)
+        several = len({trial.vine for trial in trials}) > 1
+        return [trial.vine if several else "" for trial in trials]
     return groups
 
 
