@@ -21,7 +21,7 @@ from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
-from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
+from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -90,15 +90,14 @@ def diagnose(
     unfit: dict[str, list[str]] = {}
     for name, reason in fit.left_out.items():
         unfit.setdefault(reason, []).append(name)
-    fit = replace(fit, left_out={**left_out, **fit.left_out})
-
-    def without(names: Sequence[str]) -> Diagnosis:
-        remaining = [pair for pair in pairs if pair[0].name not in names]
-        return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
-
-    result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
-    result = with_lost_frames(result, dropped)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
+    if odd := odd_trials(fit.predictor.data):
+        told.append(remark("odd_trials", odd=odd, count=len(fit.trials)))
+        others = [pair for pair in pairs if pair[0].name not in {trial.name for trial in odd}]
+        fit = initial_fit(model, others, effects, profile=False)
+    result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
+    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
+    result = with_lost_frames(result, dropped)
     result = replace(result, notes=(*result.notes, *told))
     if longer := longer_than_stated(pairs):
         result = replace(result, notes=(*result.notes, longer))

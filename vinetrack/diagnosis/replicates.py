@@ -9,7 +9,7 @@ typical scatter of pressure and of B they differ; the sensitivities of the traje
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,20 +17,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import Remark, remark
+from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.result import (
-    ADEQUATE,
     ARTEFACT,
     DROPPED_FRAMES,
     EXPECTED,
-    UNEXPLAINED,
     Diagnosis,
 )
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
+from vinetrack.inference.fit_data import FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
@@ -43,8 +40,8 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
 #
-# One such trial among thirty causes a misfit that no effect explains, and the verdict is `unexplained`. Outliers are
-# detected without the model that failed: over the middle of the growth damping roughly balances the force,
+# One such trial among thirty causes a misfit that no effect explains: it is left out and named. Outliers are detected
+# without the model that failed: over the middle of the growth damping roughly balances the force,
 #
 #     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
 #
@@ -130,40 +127,6 @@ def _force_N(trial: Trial, pressure_Pa: float) -> float:
     return (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
 
 
-def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callable[[list[str]], Diagnosis]) -> Diagnosis:
-    """Add what outlying trials mean for a diagnosis. Where the model is adequate, or the other trials support the same
-    effect, they are a note. Where no effect explains all trials but one explains the others, the explanation says so.
-    """
-    if not odd:
-        return result
-    noted = replace(result, notes=(*result.notes, remark("odd_trials", odd=odd, count=len(result.fits[0].trials))))
-    if result.verdict == ADEQUATE:
-        return noted
-    try:
-        others = without([trial.name for trial in odd])
-    except (FitError, SimulationError):
-        return noted
-    unexplained = UNEXPLAINED in (result.verdict, result.final_verdict)
-    if UNEXPLAINED in (others.verdict, others.final_verdict):
-        return result if unexplained else noted
-    if not unexplained and set(result.answer_set) & set(others.answer_set):
-        return noted
-    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
-    facts = {"odd": odd, "count": len(result.fits[0].trials), "others": others, "with_them": result.explanation}
-    words = str(Remark("odd_trials_decide", {**facts, "withdrawn": not unexplained}))
-    if unexplained:
-        return replace(result, explanation=words)
-    ranking = tuple(replace(candidate, in_answer_set=False) for candidate in result.rounds[0].ranking)
-    return _overruled(result, words, verdict=UNEXPLAINED, answer_set=(), ranking=ranking)
-
-
-def _overruled(result: Diagnosis, words: str, **first: Any) -> Diagnosis:
-    """The diagnosis of one round, without effects; `first` are the fields in which it differs from the first one."""
-    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
-    only = replace(result.rounds[0], explanation=words, **nothing, **first)
-    return replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
-
-
 # ------------------------------------------------------------------------------
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
 
@@ -185,9 +148,10 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
         return replace(result, notes=(*result.notes, remark("frames_perhaps_missing", trials=tuple(lost))))
     note = remark("with_corrected_times", verdict=result.verdict, explanation=result.explanation)
     words = str(remark("frames_missing", trials=tuple(lost)))
-    return _overruled(
-        replace(result, notes=(note,), odd_trials=()), words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,)
-    )
+    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
+    only = replace(result.rounds[0], explanation=words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,), **nothing)
+    alone = replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
+    return replace(alone, notes=(note,), odd_trials=())
 
 
 # ------------------------------------------------------------------------------

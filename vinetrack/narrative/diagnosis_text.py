@@ -20,7 +20,6 @@ from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
     expected_text,
-    odd_deciding_in_words,
     odd_in_words,
     percent,
     spaced_name,
@@ -520,7 +519,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
     ),
     "odd_trials": odd_in_words,
-    "odd_trials_decide": odd_deciding_in_words,
     "deciding_measurements": measurement_text,
     "trials_to_make": advice_text,
     "law": law_text,
