@@ -37,7 +37,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.selection import Report, SelectionStep, contradictions, select_effects
+from vinetrack.diagnosis.selection import Report, SelectionStep, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -109,9 +109,6 @@ def diagnose(
     if ladder:
         report("errors before and after")
         result = _or_note(result, "no_ladder", partial(_with_ladder, result))
-    if ladder and result.final_verdict == ADEQUATE:
-        report("looking for contradictions")
-        result = replace(result, notes=(*result.notes, *contradictions(result.fits, result.effects, result.ladder)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -268,7 +265,17 @@ def _with_ladder(result: Diagnosis) -> Diagnosis:
     last = result.rounds[-1]
     added = ("", *result.effects, *(step.effect for step in last.partial))
     table = error_ladder((*result.fits, *last.partial_fits), added, len(last.partial))
-    return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
+    against = not_better(result.effects, table["rms_left_out_m"].tolist()) if result.final_verdict == ADEQUATE else []
+    return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"], *against))
+
+
+def not_better(added: Sequence[str], errors_m: Sequence[float]) -> list[Remark]:
+    """The effects with which the error on left-out conditions does not fall: that contradicts an adequate model."""
+    return [
+        remark("left_out_error_does_not_fall", name=name, without_m=without_m, with_m=with_m)
+        for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False)
+        if with_m >= without_m
+    ]
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
