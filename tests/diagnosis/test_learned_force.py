@@ -257,13 +257,13 @@ LAWS = [
     *(learning.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
     *(learning.Law(name, (scale,)) for name, scale in SCALES.items()),
     *(learning.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
-    learning.Law("speed", peak=9.0, reference_area_m2=3e-4),
+    learning.Law("speed", peak=9.0),
     learning.Law("inverse_speed", (2.5,), peak=1.7),
     learning.Law("patch", (0.08, 0.03)),
     learning.Law("position", factor="speed", peak=4.0),
     learning.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
     learning.Law("falling_with_speed", (1.5,), "position"),
-    learning.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
+    learning.Law("speed_squared", factor="pressure", peak=2e6),
     learning.Law("periodic", (0.03, 0.0)),
 ]
 

@@ -412,7 +412,6 @@ class Law:
     kind: str
     shapes: tuple[float, ...] = ()
     factor: str = ""
-    reference_area_m2: float = 0.0
     peak: float = 1.0
 
     @property
@@ -440,10 +439,9 @@ class Law:
         """The force of each unit amplitude along a motion: as it is and, where periodic, a quarter of a period ahead.
         Shape (n_times, n_amplitudes).
         """
-        size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
         phases = [self.shapes, (*self.shapes[:1], math.pi / 2)][: self.n_amplitudes]
         force = np.column_stack([FORMS[self.kind].along(motion, shapes) for shapes in phases])
-        return size * (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force)
+        return (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force) / self.peak
 
 
 # States of a motion by their names in an effect file
@@ -501,7 +499,7 @@ FORMS = _read_forms()  # Every kind of law by its name
 
 
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
-    """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
+    """The grid of all laws."""
     largest = {name: _highest(motions, name) for name in VARIABLES}
     laws = [
         Law(kind, tuple(part * largest[form.largest] for part in parts), factor)
@@ -509,11 +507,6 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
         for parts in itertools.product(*(shape.parts for shape in form.shapes))
         for factor in ("", *form.times)
     ]
-    areas = [motion.trial.area_m2 for motion in motions]
-    # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
-    if max(areas) > 1.02 * min(areas):
-        mean_m2 = float(np.mean(areas))
-        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in (law.kind, law.factor)]
     return _with_unit_peak(laws, motions)
 
 

@@ -341,22 +341,17 @@ def effect_text(detected: RankedLaw, origin: str = "") -> str:
             bounds, plausible = (value - 2 * half, value + 2 * half), (value - half, value + half)
         more = f'tried=({value!r},), meaning="its shape"'
         parameters.append(_parameter(shape[:3], f"{value!r}, zero={value!r}", bounds, plausible, more))
-    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), ""
-    if law.reference_area_m2:
-        times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
-        state["area"] = law.reference_area_m2
-        constants = f"AREA = {law.reference_area_m2:.6g}  # m²\n\n"
     # From the law itself: it checks the formula of the file
     along = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
-    there = SimpleNamespace(**along, trial=SimpleNamespace(area_m2=law.reference_area_m2))
+    there = SimpleNamespace(**along)
     worked_N = float((law.unit_force(there) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
     return _source(
-        str(remark("law_file", law=detected.words, formula=formula, origin=origin)),
-        constants=constants,
+        str(remark("law_file", law=detected.words, formula=f"tail force {form.formula}{symbol}", origin=origin)),
+        constants="",
         parameters=parameters,
         arguments=dict(zip(names, (size, *values), strict=True)),
         body=[f"return {names[0]} * ({form.code}){times}"],
         worked_N=worked_N,
         how=f"the fitted law at this state: {size:.6g} × {worked_N / size:.6g}",
-        state=state,
+        state=_WORKED_STATE,
     )

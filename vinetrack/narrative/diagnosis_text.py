@@ -319,7 +319,6 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
     facts = {
         "size": size,
         "times": f", times {by[law.factor]}" if law.factor else "",
-        "area": ", in proportion to the cross-section of the vine" if law.reference_area_m2 else "",
         "milli": number(1e3 * scale),
         "scale": f"{scale:.2g}",
         "low": f"{1e3 * max(scale, 0.0):.0f}",
