@@ -12,7 +12,7 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import between_trials, diagnose, result, selection
+from vinetrack.diagnosis import between_trials, diagnose, result
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.between_trials import Difference, between_fits, confounded, differences, significant
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
@@ -207,7 +207,7 @@ def test_every_trial_finds_the_b_it_was_grown_with():
 def test_vines_of_different_exponents_are_told():
     one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
     fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
-    assert {told.code for told in selection.contradictions((fit,), (), None)} == {"still_drifts"}
+    assert {told.code for told in drift(fit).remarks} == {"drifts"}
     (of_n,) = (each for each in differences(fit) if each.name == "n_by_vine")
     assert of_n.p < 1e-6
     (split,) = between_fits(fit, [of_n], 0.0, lambda _: None)

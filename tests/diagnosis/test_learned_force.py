@@ -150,43 +150,28 @@ def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_p
     assert slope[:, 0] == pytest.approx(exact, abs=0.005 * np.abs(exact).max())
 
 
-def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
+def missing_from(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False))
 
 
 @pytest.mark.slow
-def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path):
-    patch = laws_of(tmp_path, "patch", -0.4, 91)
-    best = patch.laws.iloc[0]
-    assert best["law"] == "patch"
-    assert best["amplitude_N"] == pytest.approx(-0.4, abs=0.03)
-    assert best["explained"] > 0.9
-    low, high = (float(word) for word in best["words"].split(" mm")[0].split("between ")[1].split(" and "))
-    assert (low, high) == pytest.approx((120, 150), abs=2)
+def test_a_rough_patch_is_learned_where_it_is_in_every_condition_and_is_no_simple_law(tmp_path):
+    patch = missing_from(tmp_path, "patch", -0.4, 91)
+    assert patch.sentence.code in ("like_no_law", "no_law_agreed_on")
+    assert patch.learned.domain.variables == ("growth",)
     assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
     along = patch.table[patch.table["condition"] != ""]
     assert along[["lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"]].notna().all(axis=None)
     for _, one in along.groupby("condition"):
         lowest = one.loc[one["force_N"].idxmin()]
-        assert 0.1 < lowest["lead_position_m"] < 0.17
-        assert -0.7 < lowest["force_N"] - one["force_N"].median() < -0.2
+        assert 0.12 < lowest["lead_position_m"] < 0.15
+        assert -0.6 < lowest["force_N"] - one["force_N"].median() < -0.3
 
 
 @pytest.mark.slow
-def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path):
-    best = laws_of(tmp_path, "ripple", -0.5, 92).laws.iloc[0]
-    assert best["law"] == "periodic"
-    assert float(best["words"].split("every ")[1].split(" mm")[0]) == pytest.approx(60, abs=1)
-    assert best["amplitude_N"] == pytest.approx(0.5, abs=0.07)
-
-
-@pytest.mark.slow
-def test_a_friction_that_falls_with_speed_is_identified(tmp_path):
-    found = laws_of(tmp_path, "stribeck", -1.5, 93)
-    assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
-    assert found.laws["amplitude_N"].iloc[0] < 0
-    assert found.depends_on["speed"] > 0.9
+def test_a_friction_that_falls_with_speed_depends_on_speed(tmp_path):
+    assert missing_from(tmp_path, "stribeck", -1.5, 93).depends_on["speed"] > 0.9
 
 
 def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
@@ -250,28 +235,10 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
 
 
-PEAKS = {"position": 0.5, "position_squared": 0.25, "speed_squared": 81.0, "speed_cubed": 729.0, "pressure": 3e4}
-SCALES = {"falling_with_speed": 1.5, "fading_in_time": 0.04, "fading_along": 0.07}
-BEYOND = {"beyond_a_place": (0.06, 0.1), "beyond_a_speed": (1.2, 7.8), "squared_beyond_a_speed": (1.2, 61.0)}
-LAWS = [
-    *(learning.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
-    *(learning.Law(name, (scale,)) for name, scale in SCALES.items()),
-    *(learning.Law(name, (scale,), peak=peak) for name, (scale, peak) in BEYOND.items()),
-    learning.Law("speed", peak=9.0, reference_area_m2=3e-4),
-    learning.Law("inverse_speed", (2.5,), peak=1.7),
-    learning.Law("patch", (0.08, 0.03)),
-    learning.Law("position", factor="speed", peak=4.0),
-    learning.Law("patch", (0.08, 0.03), factor="pressure", peak=3e4),
-    learning.Law("falling_with_speed", (1.5,), "position"),
-    learning.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    learning.Law("periodic", (0.03, 0.0)),
-]
-
-
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+@pytest.mark.parametrize("law", [learning.Law(powers, peak=7.0) for powers in learning.LAWS], ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
-    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, 1.0)
+    estimate = inversion.ForceEstimate(0.0, np.array([-0.2]), 0.01, 1.0)
     path.write_text(effect_text(RankedLaw(law, estimate, 0.0), "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]
@@ -284,7 +251,7 @@ def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditio
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     best = proposal.tied[0]
     assert best.effect.name == "proposed_time"
-    rate = next(number for number in best.ratio.fit.numbers if number.key == "proposed_time.r")
+    rate = next(number for number in best.ratio.fit.numbers if number.key == "proposed_time.k")
     assert rate.low < -0.3 / 0.2 < rate.high
     assert best.rms_left_out_m < proposal.rms_left_out_m
 

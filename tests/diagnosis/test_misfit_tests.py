@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from grown import Pairs, pairs_of
 from hidden_truth import grown, sheet
-from scipy.integrate import quad
-from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
@@ -113,28 +111,20 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     assert selection.confounders_of(after, ["air_drag"]) == ()
 
 
-@pytest.mark.parametrize(("estimate", "sigma"), [(0.3, 0.2), (-0.5, 0.4), (2.0, 5.0)])
-def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_quadrature(estimate, sigma):
-    parameter = Parameter("C", "C", "1", 1.0, bounds=(0.0, math.inf), plausible=(0.0, 2.0))
-
-    def density(size: float) -> float:
-        return float(norm.pdf(size, estimate, sigma) * norm.pdf(size, 0.0, 2.0 / 1.959964))
-
-    whole = quad(density, 0, 20)[0]
-    mean = quad(lambda size: size * density(size), 0, 20)[0] / whole
-    variance = quad(lambda size: (size - mean) ** 2 * density(size), 0, 20)[0] / whole
-    got_mean, got_sd, limit = selection.size_not_excluded(estimate, sigma, parameter)
-    assert (got_mean, got_sd) == pytest.approx((mean, math.sqrt(variance)), rel=1e-6)
-    assert quad(density, 0, limit)[0] / whole == pytest.approx(0.95, abs=1e-6)
-
-
-def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
-    parameter = Parameter("e", "ε", "1", 0.0, plausible=(-0.1, 0.1))
-    precision = 1 / 0.02**2 + (1.959964 / 0.1) ** 2
-    for estimate in (0.03, -0.03):
-        mean, sd, limit = selection.size_not_excluded(estimate, 0.02, parameter)
-        assert (mean, sd) == pytest.approx((estimate / 0.02**2 / precision, precision**-0.5), rel=1e-6)
-        assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
+@pytest.mark.parametrize(
+    ("estimate", "plausible", "ends"),
+    [
+        (0.3, (0.0, 2.0), (0.0, 0.7)),
+        (1.9, (0.0, 2.0), (1.5, 2.0)),
+        (-0.9, (0.0, 2.0), (0.0, 0.0)),
+        (-0.3, (-1.0, 1.0), (-0.7, 0.1)),
+    ],
+    ids=["near none", "near the end of its range", "of a sign that it cannot have", "of either sign"],
+)
+def test_a_size_is_not_excluded_within_two_errors_its_plausible_range_and_its_sign(estimate, plausible, ends):
+    bounds = (-math.inf if plausible[0] < 0 else 0.0, math.inf)
+    parameter = Parameter("C", "C", "1", 0.0, bounds=bounds, plausible=plausible)
+    assert selection.sizes_not_excluded(estimate, 0.2, parameter) == pytest.approx(ends)
 
 
 B = "eversion_damping.B"

@@ -3,18 +3,16 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from lsoda_vine import B_TRUE, as_track, filmed, grown_position, small_campaign, vine_trial
 
 import vinetrack as vt
-from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors
-from vinetrack.diagnosis.replicates import OddTrial, odd_trials, replicates_of, with_odd_trials
+from vinetrack.diagnosis.replicates import odd_trials, replicates_of
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import TrialFit
@@ -157,15 +155,13 @@ def test_rows_of_other_recordings_are_named_with_the_pressure_that_was(campaign,
 
 
 @pytest.mark.slow
-def test_a_diagnosis_without_a_cause_names_the_row(campaign):
+def test_a_row_that_contradicts_the_others_is_named_and_left_out(campaign):
     result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
-    assert result.verdict == "unexplained"
+    assert result.verdict == "adequate"
+    assert [trial.name for trial in result.fit.trials] == [trial.name for trial, _ in campaign if trial.name != "t2"]
+    (note,) = (note for note in result.notes if note.code == "odd_trials")
+    assert (note.facts["odd"][0].name, note.facts["count"]) == ("t2", 12)
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
-
-
-@pytest.fixture(scope="module")
-def adequate(campaign):
-    return diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
 
 
 def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
@@ -173,40 +169,6 @@ def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
     monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", lambda *_, **__: pytest.fail("it is made again"))
     result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False, fitted=there)
     assert result.fits[0].numbers == there.numbers
-
-
-@pytest.mark.slow
-def test_an_odd_trial_of_an_adequate_campaign_is_a_note(adequate):
-    assert adequate.verdict == "adequate"
-    odd_ones = [OddTrial("t2", 12e3, 21e3), OddTrial("t5", 2e3, math.nan)]
-    outcome = with_odd_trials(adequate, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
-    assert outcome.verdict == "adequate"
-    assert outcome.notes[-1] == remark("odd_trials", odd=odd_ones, count=12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
-def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(adequate, others_say):
-    ranking = [replace(row, in_answer_set=True) for row in adequate.rounds[0].ranking if row.effect == "tail_friction"]
-    last = replace(adequate.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=tuple(ranking))
-    named = replace(adequate, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
-    others = {"tail_friction": named, "nothing": adequate}
-    others["air_drag"] = replace(named, rounds=(replace(last, answer_set=("air_drag",)),))
-    outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others[others_say])
-    said = (outcome.verdict, outcome.answer_set, outcome.effects)
-    if others_say == "tail_friction":
-        assert said == ("missing", ("tail_friction",), ("tail_friction",))
-        assert outcome.notes[-1].code == "odd_trials"
-        return
-    assert said == ("unexplained", (), ())
-    assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
-
-
-def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(adequate):
-    unexplained = replace(adequate, rounds=(replace(adequate.rounds[-1], verdict="unexplained"),))
-    without = Mock(side_effect=vt.FitError("there is nothing to fit"))
-    outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
-    assert outcome.notes[-1].code == "odd_trials"
 
 
 def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):

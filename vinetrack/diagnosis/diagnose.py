@@ -21,7 +21,7 @@ from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
-from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames, with_odd_trials
+from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -37,7 +37,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.selection import Report, SelectionStep, contradictions, select_effects
+from vinetrack.diagnosis.selection import Report, SelectionStep, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -90,15 +90,14 @@ def diagnose(
     unfit: dict[str, list[str]] = {}
     for name, reason in fit.left_out.items():
         unfit.setdefault(reason, []).append(name)
-    fit = replace(fit, left_out={**left_out, **fit.left_out})
-
-    def without(names: Sequence[str]) -> Diagnosis:
-        remaining = [pair for pair in pairs if pair[0].name not in names]
-        return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
-
-    result = with_odd_trials(_diagnosis_of(fit, effects, report), odd_trials(fit.predictor.data), without)
-    result = with_lost_frames(result, dropped)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
+    if odd := odd_trials(fit.predictor.data):
+        told.append(remark("odd_trials", odd=odd, count=len(fit.trials)))
+        others = [pair for pair in pairs if pair[0].name not in {trial.name for trial in odd}]
+        fit = initial_fit(model, others, effects, profile=False)
+    result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
+    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
+    result = with_lost_frames(result, dropped)
     result = replace(result, notes=(*result.notes, *told))
     if longer := longer_than_stated(pairs):
         result = replace(result, notes=(*result.notes, longer))
@@ -110,9 +109,6 @@ def diagnose(
     if ladder:
         report("errors before and after")
         result = _or_note(result, "no_ladder", partial(_with_ladder, result))
-    if ladder and result.final_verdict == ADEQUATE:
-        report("looking for contradictions")
-        result = replace(result, notes=(*result.notes, *contradictions(result.fits, result.effects, result.ladder)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -269,7 +265,17 @@ def _with_ladder(result: Diagnosis) -> Diagnosis:
     last = result.rounds[-1]
     added = ("", *result.effects, *(step.effect for step in last.partial))
     table = error_ladder((*result.fits, *last.partial_fits), added, len(last.partial))
-    return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
+    against = not_better(result.effects, table["rms_left_out_m"].tolist()) if result.final_verdict == ADEQUATE else []
+    return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"], *against))
+
+
+def not_better(added: Sequence[str], errors_m: Sequence[float]) -> list[Remark]:
+    """The effects with which the error on left-out conditions does not fall: that contradicts an adequate model."""
+    return [
+        remark("left_out_error_does_not_fall", name=name, without_m=without_m, with_m=with_m)
+        for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False)
+        if with_m >= without_m
+    ]
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, align_trials
+from vinetrack.diagnosis.replicates import LEAST_SCATTER, align_trials
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial
@@ -38,7 +38,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effect_prior,
     whitened_products,
 )
-from vinetrack.inference.optimiser import track_correlation, variance_floor
+from vinetrack.inference.optimiser import TYPICAL_SPREADS, track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
 from vinetrack.inference.systematics import with_unknowns
 
@@ -328,8 +328,8 @@ class ForceProblem:
         self.scatter = align_trials(fit).scatter
         rho = track_correlation(self.data)
         noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - rho**2)
-        least, scatter = LEAST_BETWEEN_TRIAL_SD, self.scatter
-        spread = (max(scatter.pressure, least[0]), max(scatter.damping, least[1]))
+        multiple = max(self.scatter.multiple, LEAST_SCATTER)
+        spread = (multiple * TYPICAL_SPREADS[0], multiple * TYPICAL_SPREADS[1])
         effects = np.zeros((len(self.data), N_TRIAL_EFFECTS))
         effects[:, [RELEASE, ORIGIN]] = self.prior.release_origin_mean
         variance = np.maximum(noise, variance_floor(self.data))

@@ -263,17 +263,16 @@ class Errors:
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
     """Compute the errors of the initial model and of every enlarged one, the last `partial` of them without a claim.
-    The floor, and the error expected of an adequate model, are those of the initial model for all: replicates laid on
-    another model scatter by the same within a few per cent. `attrs["notes"]` are remarks about trials that could not be
-    predicted.
+    The floor, and the error expected of an adequate model, are those of replicates laid on the last model that claims
+    to be one. `attrs["notes"]` are remarks about trials that could not be predicted.
     """
     import pandas as pd
 
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
-    floor_m = inside[0].floor_m
-    aligned = align_trials(fits[0])
+    settled = len(fits) - partial - 1
+    floor_m, aligned = inside[settled].floor_m, align_trials(fits[settled])
     expected = expected_error(list(itertools.chain(*aligned.courses.values())), aligned.scatter)
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +26,8 @@ from vinetrack.diagnosis.replicates import (
     Replicates,
     ResidualCourse,
     Scatter,
-    Stretches,
     align_trials,
-    common_stretches,
+    mean_square,
     orthogonal_part,
     replicates_by_condition,
     within_groups,
@@ -39,6 +38,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.errors import robust_variances
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
+from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE
 
 if TYPE_CHECKING:
@@ -91,79 +91,69 @@ def locate(fit: Fit) -> Failure:
     import pandas as pd
 
     aligned = align_trials(fit)
-    courses, together = aligned.courses, replicates_by_condition(aligned.trials)
-    rows = [_condition_row(together[name], common_stretches(courses[name]), aligned.scatter) for name in courses]
+    along, together = _residual_along_growth(aligned), replicates_by_condition(aligned.trials)
+    rows = [_condition_row(together[name], aligned.courses[name], aligned.scatter, along) for name in together]
     return Failure(
         pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_position=_residual_along_growth(courses, aligned.scatter),
+        along_position=along,
         drift=drift(fit, aligned),
     )
 
 
-def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter) -> Row:
-    """Errors of a condition, and by a normal deviate whether between-trial scatter explains stretch means as large. The
-    test statistic is the mean square of the deviates, with the effective degrees of freedom of Satterthwaite's
-    approximation, because stretches are correlated.
+def _condition_row(
+    together: Replicates, courses: Sequence[ResidualCourse], scatter: Scatter, along: pd.DataFrame
+) -> Row:
+    """Errors of a condition, and by a normal deviate whether scatter between trials explains means of the replicates
+    as far off: the mean square of the deviates of its stretches, with the degrees of freedom of one trial.
     """
-    from scipy.stats import chi2, norm
     from scipy.stats import f as fisher
+    from scipy.stats import norm
 
-    errors, trial, count = position_errors(together), together.trials[0].trial, len(together.trials)
-    covariance = scatter.covariance(stretches.response_m, stretches.noise_m2)
-    mean_m, sd_m = stretches.means_m.mean(axis=0), np.sqrt(np.diag(covariance))
-    z, worst_m, sigma_m = 0.0, math.nan, math.nan
-    # Replicates without enough frames at common times have no stretch means.
-    if mean_m.size:
-        worst, square = int(np.argmax(np.abs(mean_m))), float(np.mean(count * (mean_m / sd_m) ** 2))
-        degrees = mean_m.size**2 / float(np.sum((covariance / sd_m[:, None] / sd_m) ** 2))
-        p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
-        z, worst_m, sigma_m = norm.isf(max(p, 1e-300)), mean_m[worst], sd_m[worst] / math.sqrt(count)
+    errors, trial = position_errors(together), together.trials[0].trial
+    stretches = along[along["condition"] == trial.condition]
+    of_trial = mean_square(courses, scatter)[2]
+    square = float(np.mean(stretches["z"] ** 2))
+    p = float(fisher.sf(square, of_trial, scatter.dof * of_trial if scatter.dof else math.inf))
+    worst = stretches.iloc[int(stretches["mean_residual_m"].abs().argmax())]
     return {
         "vine": trial.vine,
         "condition": trial.condition,
         "pressure_Pa": trial.pressure_Pa,
         "payload_kg": trial.payload_kg,
-        "n_trials": count,
+        "n_trials": len(courses),
         "rms_m": errors["rms_position_m"],
         "floor_m": errors["replicate_floor_m"],
         "ratio": errors["ratio"],
         "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
-        "z": float(z),
+        "z": float(norm.isf(max(p, 1e-300))),
         "worst_at_s": errors["worst_at_s"],
         "worst_at_m": errors["worst_at_m"],
-        "worst_residual_m": float(worst_m),
-        "worst_sigma_m": float(sigma_m),
+        "worst_residual_m": float(worst["mean_residual_m"]),
+        "worst_sigma_m": float(worst["sigma_m"]),
     }
 
 
-def _residual_along_growth(courses: Mapping[str, Sequence[ResidualCourse]], scatter: Scatter) -> pd.DataFrame:
+def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
     """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
     its standard error.
     """
     import pandas as pd
 
-    rows: list[tuple[object, ...]] = []
-    for condition, members in courses.items():
+    multiple, rows = aligned.scatter.multiple, list[tuple[object, ...]]()
+    every = list(itertools.chain(*aligned.courses.values()))
+    for condition, members in aligned.courses.items():
         vine = members[0].trial.vine
-        of_vine = [course for course in itertools.chain(*courses.values()) if course.trial.vine == vine]
-        reach_m = max(float(course.lead_position_m.max()) for course in of_vine)
+        reach_m = max(float(course.lead_position_m.max()) for course in every if course.trial.vine == vine)
         edges = np.linspace(0.0, reach_m, MAX_STRETCHES + 1)
-        in_stretches = [member.means("lead_position_m", edges) for member in members]
-        means_m = np.array([means for means, _ in in_stretches])
-        variances = np.array(
-            [
-                np.diag(scatter.covariance(np.nan_to_num(means[:, 1:]), member.noise(count)))
-                for member, (means, count) in zip(members, in_stretches, strict=True)
-            ]
-        )
-        present = np.isfinite(means_m).all(axis=2)
-        for k in np.flatnonzero(present.any(axis=0)).tolist():
-            reached, low, high = present[:, k], float(edges[k]), float(edges[k + 1])
-            count = int(reached.sum())
-            mean_m = float(means_m[reached, k, 0].mean())
-            sigma_m = math.sqrt(float(variances[reached, k].sum())) / count
-            rows.append((vine, condition, low, high, (low + high) / 2, mean_m, sigma_m, mean_m / sigma_m, count))
+        for low, high in itertools.pairwise(edges.tolist()):
+            inside = [(of, (of.lead_position_m >= low) & (of.lead_position_m <= high)) for of in members]
+            there = [(of, of.residual_m[at].mean(), of.response_m[at].mean(axis=0)) for of, at in inside if at.any()]
+            if count := len(there):
+                mean_m = float(np.mean([residual_m for _, residual_m, _ in there]))
+                variances = [multiple**2 * response_m @ response_m + of.position_m2 for of, _, response_m in there]
+                sigma_m = math.sqrt(sum(variances)) / count
+                rows.append((vine, condition, low, high, (low + high) / 2, mean_m, sigma_m, mean_m / sigma_m, count))
     columns = ("vine", "condition", "from_m", "to_m", "lead_position_m", "mean_residual_m", "sigma_m", "z", "n_trials")
     return pd.DataFrame(rows, columns=list(columns))
 
@@ -316,8 +306,7 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
         response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
         deviations = aligned.columns[i][:, [PRESSURE, DAMPING_DEVIATION]]
         levers = sensitivity @ orthogonal_part(deviations, aligned.columns[i][:, others]) / response[i]
-        # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
-        scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
+        scatter = float(np.sum((TYPICAL_SPREADS * levers) ** 2))
         variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
     known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
     known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION

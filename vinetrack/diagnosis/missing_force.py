@@ -12,15 +12,12 @@ model lacks.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from types import CodeType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -394,161 +391,60 @@ def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
 
 
 # ------------------------------------------------------------------------------
-# Simple laws that a missing force may follow, each a row of `force_laws.csv` beside this file.
-#
-# A row holds the size (name, symbol and unit), the law as code of an effect file and as a formula, the kinds that it is
-# also tried multiplied by, and its shape parameters (name, symbol, unit), each with the values that are tried, as parts
-# of the `largest` growth, speed or time. All of these are chosen. Values beyond 0 are spaced by ratios. Every law is
-# scaled to a peak of 1 along the motions, so that its amplitude is the largest force, N. A periodic law has two
-# amplitudes, of a sine and a cosine.
+# Simple laws that a missing force may follow: products of powers of what moves. Whatever has a shape of its own, such
+# as a rough patch or a friction that falls with speed, is told by the learned force.
+
+
+class Quantity(NamedTuple):
+    """What a law may depend on: attribute of a motion, name in an effect file, symbol, and unit."""
+
+    name: str
+    attribute: str
+    state: str
+    symbol: str
+    unit: str
+
+
+QUANTITIES = (
+    Quantity("position", "tail_position_m", "tail_position", "x", "m"),
+    Quantity("speed", "tail_velocity_m_s", "tail_velocity", "ẋ", "(m/s)"),
+    Quantity("pressure", "pressure_Pa", "pressure", "P", "Pa"),
+    Quantity("time", "time_s", "time", "t", "s"),
+)
+
+# The laws, by their powers of each quantity (chosen)
+LAWS = (
+    (0, 0, 0, 0), (1, 0, 0, 0), (2, 0, 0, 0), (0, 1, 0, 0), (0, 2, 0, 0), (0, 3, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1),
+    (1, 1, 0, 0), (2, 1, 0, 0), (1, 2, 0, 0), (1, 0, 1, 0), (2, 0, 1, 0), (0, 1, 1, 0), (0, 2, 1, 0),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Law:
-    """One form of force along a motion: its kind, by its name in `FORMS`, the values of its shape parameters, SI, and
-    the kind that it is multiplied by: "position", "speed", "pressure" or nothing. The phase of a periodic law is free.
-    """
+    """A force in proportion to powers of the quantities, `peak` at its largest per unit of its coefficient."""
 
-    kind: str
-    shapes: tuple[float, ...] = ()
-    factor: str = ""
-    reference_area_m2: float = 0.0
+    powers: tuple[int, int, int, int]
     peak: float = 1.0
 
     @property
+    def factors(self) -> list[tuple[Quantity, int]]:
+        """The quantities that it depends on, with their powers."""
+        return [(quantity, power) for quantity, power in zip(QUANTITIES, self.powers, strict=True) if power]
+
+    @property
     def name(self) -> str:
-        """Name of the law: its kind and factor."""
-        return f"{self.kind}_by_{self.factor}" if self.factor else self.kind
+        """Name of the law: `speed2_pressure`."""
+        return "_".join(f"{of.name}{power if power > 1 else ''}" for of, power in self.factors) or "constant"
 
     @property
-    def n_amplitudes(self) -> int:
-        """Number of its amplitudes."""
-        return 2 if self.kind == "periodic" else 1
-
-    @property
-    def n_shapes(self) -> int:
-        """Number of shape parameters that are searched over."""
-        return sum(len(shape.parts) > 1 for shape in FORMS[self.kind].shapes)
-
-    @property
-    def is_unresolved(self) -> bool:
-        """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
-        # 1e-3: least width of a local force that is reported (chosen)
-        return self.kind == "patch" and not sum(self.shapes) - max(self.shapes[0], 0.0) > 1e-3
+    def symbols(self) -> str:
+        """What it is in proportion to: `ẋ² P`; blank for a constant."""
+        return " ".join(f"{of.symbol}{('', '²', '³')[power - 1]}" for of, power in self.factors)
 
     def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion: as it is and, where periodic, a quarter of a period ahead.
-        Shape (n_times, n_amplitudes).
-        """
-        size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
-        phases = [self.shapes, (*self.shapes[:1], math.pi / 2)][: self.n_amplitudes]
-        force = np.column_stack([FORMS[self.kind].along(motion, shapes) for shapes in phases])
-        return size * (force * FORMS[self.factor].along(motion)[:, None] if self.factor else force)
-
-
-# States of a motion by their names in an effect file
-STATE = {
-    "lead_position": "lead_position_m", "tail_position": "tail_position_m", "tail_velocity": "tail_velocity_m_s",
-    "pressure": "pressure_Pa", "time": "time_s",
-}  # fmt: skip
-
-
-class Shape(NamedTuple):
-    """A shape parameter of a law, and the values that are tried."""
-
-    name: str
-    symbol: str
-    unit: str
-    parts: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class LawForm:
-    """A kind of law: a row of `force_laws.csv`."""
-
-    size: tuple[str, str, str]
-    code: str
-    compiled: CodeType
-    formula: str
-    times: tuple[str, ...]
-    largest: str
-    shapes: tuple[Shape, ...]
-
-    def along(self, motion: FittedMotion, shapes: Sequence[float] = ()) -> Floats:
-        """The shape along a motion, as its code says, shape (n_times,)."""
-        state = SimpleNamespace(**{name: getattr(motion, attribute) for name, attribute in STATE.items()})
-        known = dict(zip((shape.name for shape in self.shapes), shapes, strict=True))
-        return np.asarray(eval(self.compiled, {"np": np, "s": state, **known}) + 0.0 * motion.time_s)
-
-
-def _read_forms() -> dict[str, LawForm]:
-    forms = {}
-    with Path(__file__).with_name("force_laws.csv").open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            described = [each.split(":") for each in row["shapes"].split(";") if each]
-            shapes = tuple(
-                Shape(name, symbol, unit, tuple(map(float, parts.split())))
-                for names, parts in described
-                for name, symbol, unit in [names.split()]
-            )
-            size, code = (row["size"], row["symbol"], row["unit"]), compile(row["code"], row["kind"], "eval")
-            times = tuple(row["times"].split())
-            forms[row["kind"]] = LawForm(size, row["code"], code, row["formula"], times, row["largest"], shapes)
-    return forms
-
-
-FORMS = _read_forms()  # Every kind of law by its name
-
-
-def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
-    """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
-    largest = {name: _highest(motions, name) for name in VARIABLES}
-    laws = [
-        Law(kind, tuple(part * largest[form.largest] for part in parts), factor)
-        for kind, form in FORMS.items()
-        for parts in itertools.product(*(shape.parts for shape in form.shapes))
-        for factor in ("", *form.times)
-    ]
-    areas = [motion.trial.area_m2 for motion in motions]
-    # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
-    if max(areas) > 1.02 * min(areas):
-        mean_m2 = float(np.mean(areas))
-        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in (law.kind, law.factor)]
-    return _with_unit_peak(laws, motions)
-
-
-def laws_near(law: Law, motions: Sequence[FittedMotion], part: float) -> list[Law]:
-    """Laws near another: each shape that is searched over varied by less than this part of a step of the grid."""
-    form, varied = FORMS[law.kind], []
-    for value, shape in zip(law.shapes, form.shapes, strict=True):
-        first, last, steps = shape.parts[0], shape.parts[-1], len(shape.parts) - 1
-        change = part * np.linspace(-0.75, 0.75, 9) / steps if steps else np.zeros(1)
-        if first > 0:
-            values = value * (last / first) ** change
-        else:
-            values = value + _highest(motions, form.largest) * (last - first) * change
-        varied.append(values.tolist())
-    return _with_unit_peak([replace(law, shapes=shapes) for shapes in itertools.product(*varied)], motions)
-
-
-def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
-    """The laws scaled to a peak of 1 along the motions, without patches that act only at the start. Those that peak at
-    rest, where positions do not determine the speed, are scaled to 1 at the lowest speed observed.
-    """
-    # 0.05: part of the growth over which a vine accelerates; the size of a law at rest is not observed (chosen)
-    started = [(motion.lead_position_m >= 0.05 * motion.lead_position_m.max())[motion.is_visited] for motion in motions]
-    scaled = []
-    for law in (replace(law, peak=1.0) for law in laws):
-        forces = [np.abs(law.unit_force(motion))[motion.is_visited] for motion in motions]
-        peak = 1.0 if law.kind == "periodic" else max(float(force.max()) for force in forces)
-        peak_after_start = max(
-            float(np.max(force[after], initial=0.0)) for force, after in zip(forces, started, strict=True)
-        )
-        if law.kind in ("inverse_speed", "falling_with_speed"):
-            peak = peak_after_start
-        if law.kind != "patch" or peak_after_start >= 0.5 * peak:
-            scaled.append(replace(law, peak=peak or 1.0))
-    return scaled
+        """The force of unit amplitude along a motion, shape (n_times, 1)."""
+        of_each = [getattr(motion, of.attribute) ** power for of, power in self.factors]
+        return np.asarray(math.prod(of_each, start=np.ones_like(motion.time_s)) / self.peak)[:, None]
 
 
 @dataclass(frozen=True)
@@ -562,61 +458,51 @@ class RankedLaw:
     largest_N: float = math.inf
 
     @property
+    def amplitude_N(self) -> float:
+        """The force at its largest, N."""
+        return float(self.estimate.amplitude[0])
+
+    @property
     def is_detected(self) -> bool:
         """Whether its amplitude differs significantly from zero, and is plausible for these motions."""
-        size_N = math.hypot(*self.estimate.amplitude)
         # 5.0: standard errors that the amplitude of a law must differ from zero to be detected
-        return 5.0 * self.estimate.sigma < size_N < self.largest_N and not self.law.is_unresolved
+        return 5.0 * self.estimate.sigma < abs(self.amplitude_N) < self.largest_N
 
     @property
     def words(self) -> str:
         """Description of the law with its amplitude."""
-        return str(remark("law", law=self.law, amplitude_N=self.estimate.amplitude, sigma_N=self.estimate.sigma))
+        return str(remark("law", law=self.law, amplitude_N=self.amplitude_N, sigma_N=self.estimate.sigma))
 
     @property
     def row(self) -> dict[str, Any]:
         """As a row of `laws` in `diagnosis.json`."""
-        amplitude, sigma_N = self.estimate.amplitude, self.estimate.sigma
-        size_N = float(amplitude[0]) if amplitude.size == 1 else math.hypot(*amplitude)
         of_law = {"law": self.law.name, "words": self.words, "explained": self.explained}
-        return of_law | {"amplitude_N": size_N, "sigma_N": sigma_N}
+        return of_law | {"amplitude_N": self.amplitude_N, "sigma_N": self.estimate.sigma}
 
 
 def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:
-    """The best law of each kind, over the grid, near the best of each kind, then nearer to the first: detected ones
-    first, then by their Bayesian information criterion (Schwarz, Annals of Statistics 6, 461, 1978). Misfit that not
-    even the best force explains is counted as further noise: it inflates the variance of every independent residual.
-    `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
+    """All laws: detected ones first, then by their Bayesian information criterion (Schwarz, Annals of Statistics 6,
+    461, 1978). Misfit that not even the best force explains is counted as further noise: it inflates the variance of
+    every independent residual. `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
-    largest_N = 0.0
+    largest_N, laws = 0.0, [Law(powers) for powers in LAWS]
+    peaks = np.max([[law.unit_force(motion)[motion.is_visited].max() for law in laws] for motion in point.motions], 0)
+    laws = [replace(law, peak=float(peak) or 1.0) for law, peak in zip(laws, peaks, strict=True)]
     for motion in point.motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
         # 10.0: largest force that is reported, in parts of drive, weight and inertia at their largest (chosen)
         largest_N = max(largest_N, 10.0 * float(np.max(drive_N + body_N)))
-
-    def unit_forces(motion: FittedMotion) -> Floats:
-        return np.hstack([law.unit_force(motion) for law in laws])
-
-    laws, estimated, best = laws_on_grid(point.motions), list[tuple[Law, ForceEstimate]](), dict[str, RankedLaw]()
-    for near, part in ((None, 1.0), (1, 0.25), (0, 0.0)):
-        equations, end = ForceEquations(problem, point, unit_forces), 0
-        for law in laws:
-            begin, end = end, end + law.n_amplitudes
-            estimated.append((law, equations.estimate(slice(begin, end))))
-        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-        noise = problem.inflation(chi2 - largest)
-        ranked = []
-        for law, estimate in estimated:
-            # A factor counts as a parameter, because it was chosen among several.
-            n_parameters = law.n_amplitudes + law.n_shapes + bool(law.factor)
-            bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(problem.n_independent)
-            ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
-        best = {}
-        for each in sorted(ranked, key=lambda law: (not law.is_detected, law.bic)):
-            best.setdefault(each.law.name, each)
-        laws = [law for each in list(best.values())[:near] for law in laws_near(each.law, point.motions, part)]
-    return list(best.values())
+    equations = ForceEquations(problem, point, lambda motion: np.hstack([law.unit_force(motion) for law in laws]))
+    estimates = [equations.estimate(slice(k, k + 1)) for k in range(len(laws))]
+    largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for estimate in estimates))
+    noise, ranked = problem.inflation(chi2 - largest), list[RankedLaw]()
+    for law, estimate in zip(laws, estimates, strict=True):
+        # A factor counts as a parameter, because it was chosen among several.
+        n_parameters = max(sum(power > 0 for power in law.powers), 1)
+        bic = (largest - estimate.delta_chi2) / noise + n_parameters * math.log(problem.n_independent)
+        ranked.append(RankedLaw(law, estimate, bic, largest_N=largest_N))
+    return sorted(ranked, key=lambda law: (not law.is_detected, law.bic))
 
 
 # ------------------------------------------------------------------------------
@@ -697,9 +583,5 @@ def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_r
     # Misfit that not even a free force takes away limits how well laws can be told apart.
     # 0.05: difference of the explained parts within which other laws are named with the best (chosen)
     margin = 0.05 + float(np.nan_to_num(1 - misfit_reduction))
-    others = [
-        law.words
-        for law in laws[1:]
-        if law.is_detected and law.explained > best.explained - margin and law.law.n_shapes <= best.law.n_shapes
-    ]
+    others = [law.words for law in laws[1:] if law.is_detected and law.explained > best.explained - margin]
     return remark("like_a_law", **told, others=others[:2])

@@ -33,10 +33,9 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import (
-    FORMS,
     LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
-    STATE,
+    QUANTITIES,
     VARIABLES,
     Domain,
     LearnedForce,
@@ -314,49 +313,25 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
 # A law as an effect file.
 
 # State of the worked example; a convention of this file
-_WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
+_WORKED_STATE = {"tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
 
 
 def effect_text(detected: RankedLaw, origin: str = "") -> str:
-    """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
-    worked example.
+    """Source of an effect file that holds a law: docstring, parameter with unit and bounds, function, worked
+    example.
     """
-    law, form = detected.law, FORMS[detected.law.kind]
-    times, symbol, unit = "", "", form.size[2]
-    if law.factor:
-        by = FORMS[law.factor]
-        times, symbol = f" * {by.code}", f" {by.formula.split()[-1]}"
-        unit += by.size[2].removeprefix("N")
-    amplitude, shapes = detected.estimate.amplitude, law.shapes
-    if law.kind == "periodic":
-        amplitude, shapes = np.array([math.hypot(*amplitude)]), (shapes[0], math.atan2(amplitude[1], amplitude[0]))
-    size, *values = (float(f"{value:.6g}") for value in (amplitude[0] / law.peak, *shapes))
-    names = [form.size[0], *(shape.name for shape in form.shapes)]
-    bounds, plausible = (-100 * abs(size), 100 * abs(size)), (0.0, 10 * size)
-    parameters = [_parameter((*form.size[:2], unit), repr(size), bounds, plausible, 'meaning="size of the law"')]
-    for shape, value in zip(form.shapes, values, strict=True):
-        bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
-        if shape.name in ("phi", "y_1"):
-            half = math.pi if shape.name == "phi" else max(abs(value), 0.01)
-            bounds, plausible = (value - 2 * half, value + 2 * half), (value - half, value + half)
-        more = f'tried=({value!r},), meaning="its shape"'
-        parameters.append(_parameter(shape[:3], f"{value!r}, zero={value!r}", bounds, plausible, more))
-    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), ""
-    if law.reference_area_m2:
-        times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
-        state["area"] = law.reference_area_m2
-        constants = f"AREA = {law.reference_area_m2:.6g}  # m²\n\n"
+    law, size = detected.law, float(f"{detected.amplitude_N / detected.law.peak:.6g}")
+    unit = "·".join(f"{of.unit}{('', '²', '³')[power - 1]}" for of, power in law.factors)
+    names, limits = ("k", "k", f"N/({unit})" if unit else "N"), ((-100 * abs(size), 100 * abs(size)), (0.0, 10 * size))
     # From the law itself: it checks the formula of the file
-    along = {STATE[name]: np.array([value]) for name, value in _WORKED_STATE.items()}
-    there = SimpleNamespace(**along, trial=SimpleNamespace(area_m2=law.reference_area_m2))
-    worked_N = float((law.unit_force(there) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
+    there = SimpleNamespace(**{of.attribute: np.array([_WORKED_STATE[of.state]]) for of in QUANTITIES})
     return _source(
-        str(remark("law_file", law=detected.words, formula=formula, origin=origin)),
-        constants=constants,
-        parameters=parameters,
-        arguments=dict(zip(names, (size, *values), strict=True)),
-        body=[f"return {names[0]} * ({form.code}){times}"],
-        worked_N=worked_N,
-        how=f"the fitted law at this state: {size:.6g} × {worked_N / size:.6g}",
-        state=state,
+        str(remark("law_file", law=detected.words, formula=f"tail force k {law.symbols}".rstrip(), origin=origin)),
+        constants="",
+        parameters=[_parameter(names, repr(size), *limits, 'meaning="size of the law"')],
+        arguments={"k": size},
+        body=[" * ".join(["return k", *(f"s.{of.state}" for of, power in law.factors for _ in range(power))])],
+        worked_N=detected.amplitude_N * float(law.unit_force(there)[0, 0]),  # type: ignore[arg-type]
+        how="the fitted law at this state",
+        state=_WORKED_STATE,
     )

@@ -2,17 +2,14 @@
 
 Every trial has its own release, and its own origin where no standstill was filmed; a model is laid on each by the same
 two (`vinetrack.inference.fit.predict_prepared`). What then distinguishes replicates is their scatter, the floor below
-which no model can fall. Residuals of one trial are correlated from frame to frame: a trial with 3 % more B is late
-everywhere. Frames are therefore not counted as independent. Every trial is cut into a few stretches, and the covariance
-of the stretch means between replicates has three parameters for all conditions: the scatter of pressure and of B,
-propagated by the sensitivities of the trajectories, and a residual scatter that is independent between stretches. They
-are estimated from differences between replicates alone, so that a model that fails does not inflate them.
+which no model can fall. Two trials of a condition tell little about it, all of them together tell by what multiple of a
+typical scatter of pressure and of B they differ; the sensitivities of the trajectories spread it over the conditions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,22 +17,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import Remark, remark
+from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.result import (
-    ADEQUATE,
     ARTEFACT,
     DROPPED_FRAMES,
     EXPECTED,
-    MAX_STRETCHES,
-    UNEXPLAINED,
     Diagnosis,
 )
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
+from vinetrack.inference.fit_data import FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor, middle_speed
 from vinetrack.tracks.frame_timing import frames_surely_missing
 from vinetrack.tracks.position_noise import rest_points
@@ -46,8 +40,8 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
 #
-# One such trial among thirty causes a misfit that no effect explains, and the verdict is `unexplained`. Outliers are
-# detected without the model that failed: over the middle of the growth damping roughly balances the force,
+# One such trial among thirty causes a misfit that no effect explains: it is left out and named. Outliers are detected
+# without the model that failed: over the middle of the growth damping roughly balances the force,
 #
 #     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
 #
@@ -133,40 +127,6 @@ def _force_N(trial: Trial, pressure_Pa: float) -> float:
     return (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
 
 
-def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callable[[list[str]], Diagnosis]) -> Diagnosis:
-    """Add what outlying trials mean for a diagnosis. Where the model is adequate, or the other trials support the same
-    effect, they are a note. Where no effect explains all trials but one explains the others, the explanation says so.
-    """
-    if not odd:
-        return result
-    noted = replace(result, notes=(*result.notes, remark("odd_trials", odd=odd, count=len(result.fits[0].trials))))
-    if result.verdict == ADEQUATE:
-        return noted
-    try:
-        others = without([trial.name for trial in odd])
-    except (FitError, SimulationError):
-        return noted
-    unexplained = UNEXPLAINED in (result.verdict, result.final_verdict)
-    if UNEXPLAINED in (others.verdict, others.final_verdict):
-        return result if unexplained else noted
-    if not unexplained and set(result.answer_set) & set(others.answer_set):
-        return noted
-    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
-    facts = {"odd": odd, "count": len(result.fits[0].trials), "others": others, "with_them": result.explanation}
-    words = str(Remark("odd_trials_decide", {**facts, "withdrawn": not unexplained}))
-    if unexplained:
-        return replace(result, explanation=words)
-    ranking = tuple(replace(candidate, in_answer_set=False) for candidate in result.rounds[0].ranking)
-    return _overruled(result, words, verdict=UNEXPLAINED, answer_set=(), ranking=ranking)
-
-
-def _overruled(result: Diagnosis, words: str, **first: Any) -> Diagnosis:
-    """The diagnosis of one round, without effects; `first` are the fields in which it differs from the first one."""
-    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
-    only = replace(result.rounds[0], explanation=words, **nothing, **first)
-    return replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
-
-
 # ------------------------------------------------------------------------------
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
 
@@ -188,9 +148,10 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
         return replace(result, notes=(*result.notes, remark("frames_perhaps_missing", trials=tuple(lost))))
     note = remark("with_corrected_times", verdict=result.verdict, explanation=result.explanation)
     words = str(remark("frames_missing", trials=tuple(lost)))
-    return _overruled(
-        replace(result, notes=(note,), odd_trials=()), words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,)
-    )
+    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
+    only = replace(result.rounds[0], explanation=words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,), **nothing)
+    alone = replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
+    return replace(alone, notes=(note,), odd_trials=())
 
 
 # ------------------------------------------------------------------------------
@@ -284,10 +245,9 @@ def first_that_counts(trial: TrialFit) -> int:
 
 
 # ------------------------------------------------------------------------------
-# Residuals of single trials averaged over stretches of their growth, and the scatter of replicates in them.
+# How far trials scatter: by what multiple of a typical scatter of pressure and of B, as replicates show it.
 
-# Lower limits of the standard deviations of pressure and B where both are needed (chosen)
-LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
+LEAST_SCATTER = 0.5  # Least scatter of trials, in multiples of the typical one, where it is needed (chosen)
 
 
 @dataclass(frozen=True)
@@ -312,8 +272,14 @@ class AlignedTrials:
 
     @cached_property
     def scatter(self) -> Scatter:
-        """The scatter of replicates."""
-        return _replicate_scatter(self.fit, list(self.courses.values()))
+        """The multiple of the typical scatter at which an adequate model would be off by the replicate floor."""
+        together, beyond, typical, dof = replicates_by_condition(self.trials), 0.0, 0.0, 0
+        for condition, members in self.courses.items():
+            if not math.isnan(floor_m := together[condition].floor_m):
+                beyond += sum(floor_m**2 - member.position_m2 for member in members)
+                typical += sum(float(np.trace(member.typical_m2)) for member in members)
+                dof += len(members) - 1
+        return Scatter(math.sqrt(max(beyond, 0.0) / max(typical, 1e-300)), dof) if dof else Scatter(1.0, 0)
 
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""
@@ -334,36 +300,21 @@ def orthogonal_part(columns: Floats, others: Floats) -> Floats:
     return np.asarray(columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0])
 
 
-@dataclass(frozen=True)
-class ResidualCourse:
-    """One trial from its first motion on: residual and its responses to deviations of pressure and ln B, as columns of
-    `values_m`, shape (n_points, 3); coordinates along the growth; variance of a single position, and of the noise of
-    means, times their number of frames, and of the origin.
+class ResidualCourse(NamedTuple):
+    """One trial from its first motion on, arrays of shape (n_points, …): residual; response to one typical standard
+    deviation of pressure and of ln B, (n_points, 2); place along the growth; variance of a position by its own errors.
     """
 
     trial: Trial
-    values_m: Floats
-    time_s: Floats
+    residual_m: Floats
+    response_m: Floats
     lead_position_m: Floats
     position_m2: float
-    noise_m2: float
-    origin_m2: float
 
-    def means(self, along: str, edges: Floats) -> tuple[Floats, Floats]:
-        """Means of the values in each stretch, NaN where there is no frame, and the numbers of frames. Shapes: edges
-        (n_stretches + 1,) → (n_stretches, 3), (n_stretches,).
-        """
-        at = getattr(self, along)
-        stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
-        inside = (at >= edges[0]) & (at <= edges[-1])
-        total, count = np.zeros((edges.size - 1, 3)), np.zeros(edges.size - 1)
-        np.add.at(total, stretch[inside], self.values_m[inside])
-        np.add.at(count, stretch[inside], 1.0)
-        return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
-
-    def noise(self, count: Floats) -> Floats:
-        """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
-        return np.asarray(np.diag(self.noise_m2 / np.maximum(count, 1.0)) + self.origin_m2)
+    @property
+    def typical_m2(self) -> Floats:
+        """Covariance by time of what typical deviations do, m²; its trace is their mean square. Shape (2, 2)."""
+        return np.asarray(self.response_m.T @ self.response_m / len(self.response_m))
 
 
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
@@ -376,112 +327,46 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
         kept = [RELEASE, PRESSURE, DAMPING_DEVIATION]
         columns[moving[-1] + 1 :, kept] = columns[moving[-1], kept]
     response = orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], columns[:, aligned.nuisances(i)])
-    noise_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
     moved = slice(first_that_counts(trial), None)
     return ResidualCourse(
         trial=trial.trial,
-        values_m=np.column_stack([trial.residual_m, response])[moved],
-        time_s=trial.time_s[moved] - trial.release_s,
+        residual_m=trial.residual_m[moved],
+        response_m=response[moved] * TYPICAL_SPREADS,
         lead_position_m=trial.predicted_position_m[moved] - trial.origin_m,
         position_m2=trial_data.mean_noise_m**2 + trial_data.position_systematic_m**2,
-        noise_m2=noise_m2,
-        origin_m2=noise_m2 / max(trial_data.n_rest, 1),
     )
 
 
-class Stretches(NamedTuple):
-    """Stretches of time that all replicates of a condition cover: mean residuals, shape (n_trials, n), their responses
-    to pressure and ln B, (n, 2), and their covariance from the noise of the tracks alone, (n, n).
+class Scatter(NamedTuple):
+    """Scatter of trials in multiples of a typical one, and the replicates beyond the first of each condition that it
+    was found from; where there are none, the typical one.
     """
 
-    means_m: Floats
-    response_m: Floats
-    noise_m2: Floats
-
-
-def common_stretches(members: Sequence[ResidualCourse]) -> Stretches:
-    """The stretches in which all members have frames, of the time that all were recorded in."""
-    start = max(float(member.time_s[0]) for member in members)
-    end = min(float(member.time_s[-1]) for member in members)
-    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
-    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
-    edges = np.linspace(start, max(end, start), max(min(MAX_STRETCHES, frames // 2), 1) + 1)
-    parts = [member.means("time_s", edges) for member in members]
-    all_means = np.array([means for means, _ in parts])
-    reached = np.isfinite(all_means).all(axis=(0, 2))
-    noise = [member.noise(count[reached]) for member, (_, count) in zip(members, parts, strict=True)]
-    return Stretches(all_means[:, reached, 0], all_means[:, reached, 1:].mean(axis=0), np.mean(noise, axis=0))
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """Between-trial standard deviations of pressure (relative) and ln B, and of a residual, relative to their effect.
-    `dof` counts replicates beyond the first of each condition. Where it is 0, the standard deviations of pressure and B
-    are those of the fit.
-    """
-
-    pressure: float
-    damping: float
-    residual: float
+    multiple: float
     dof: int
 
-    def covariance(self, response_m: Floats, noise_m2: Floats) -> Floats:
-        """Covariance of the means of one trial's stretches, m². Shapes: response_m (n, 2), noise_m2 (n, n) → (n, n)."""
-        shared = response_m * (self.pressure**2, self.damping**2) @ response_m.T
-        residual = self.residual**2 * float(np.trace(shared)) / max(len(shared), 1)
-        # 1e-6: lower limit of the error of a stretch mean, m (chosen)
-        return np.asarray(shared + noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 
-
-def _replicate_scatter(fit: Fit, courses: Sequence[Sequence[ResidualCourse]]) -> Scatter:
-    """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates."""
-    from scipy.optimize import minimize
-
-    start_values = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
-    lower_bounds, upper_bounds = np.log((1e-5, 1e-5, 1e-3)), np.log((0.2, 0.5, 3.0))  # Bounds of the search (chosen)
-    groups = [common_stretches(members) for members in courses if len(members) > 1]
-    dof = sum(len(group.means_m) - 1 for group in groups)
-    if dof < 1:
-        spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]
-        return Scatter(spreads[0], spreads[1], start_values[2], 0)
-    deviations = [group.means_m - group.means_m.mean(axis=0) for group in groups]
-
-    def scatter(logs: Floats) -> Scatter:
-        pressure, damping, residual = np.exp(np.clip(logs, lower_bounds, upper_bounds)).tolist()
-        return Scatter(pressure, damping, residual, dof)
-
-    def minus_two_log_likelihood(logs: Floats) -> float:
-        total = 0.0
-        for group, deviation_m in zip(groups, deviations, strict=True):
-            covariance = scatter(logs).covariance(group.response_m, group.noise_m2)
-            total += (len(deviation_m) - 1) * float(np.linalg.slogdet(covariance)[1])
-            total += float(np.sum(deviation_m * np.linalg.solve(covariance, deviation_m.T).T))
-        return total
-
-    how = {"xatol": 0.02, "fatol": 0.01}
-    return scatter(minimize(minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options=how).x)
+def mean_square(courses: Sequence[ResidualCourse], scatter: Scatter) -> tuple[float, float, float]:
+    """Mean square error of an adequate model over trials of equal weight that scatter like replicates, m², its degrees
+    of freedom (Satterthwaite), and those of a single trial. That of a trial, S u + e with u ~ N(0, Σ), has the variance
+    2 tr((ΣSᵀS/n)²).
+    """
+    shared = [scatter.multiple**2 * course.typical_m2 for course in courses]
+    mean_m2 = np.array([np.trace(of) + one.position_m2 for of, one in zip(shared, courses, strict=True)])
+    by_position = [one.position_m2**2 / len(one.residual_m) for one in courses]
+    variance_m4 = 2 * (np.array([np.trace(of @ of) for of in shared]) + by_position)
+    degrees = 2 * float(np.sum(mean_m2)) ** 2 / float(np.sum(variance_m4))
+    return float(np.mean(mean_m2)), degrees, float(np.mean(2 * mean_m2**2 / variance_m4))
 
 
 def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
-    """Error of an adequate model over these trials, of equal weight, that scatter like their replicates, rms, m, and
-    the ends of its 95 % range; NaN without replicates. A residual S u + e, u ~ N(0, Σ), has a mean square of tr(GΣ) +
-    σ², G = SᵀS/n, with the variance 2 tr((GΣ)²). As many degrees of freedom (Satterthwaite) as a trial has, so many has
-    every replicate that Σ was estimated from: the range is of F.
+    """Error of an adequate model over these trials, rms, m, and the ends of its 95 % range; NaN without replicates. As
+    many degrees of freedom as a trial has, so many has every replicate: the range is of F.
     """
     from scipy.stats import f as fisher
 
     if not scatter.dof:
         return dict.fromkeys(EXPECTED, math.nan)
-    moments = np.zeros((len(courses), 2))  # mean and variance of the mean square of each trial
-    for k, course in enumerate(courses):
-        response_m = course.values_m[:, 1:]
-        shared = response_m.T @ response_m / len(response_m) * (scatter.pressure**2, scatter.damping**2)
-        residual_m2 = scatter.residual**2 * float(np.trace(shared))
-        mean_m2 = float(np.trace(shared)) + residual_m2 + course.position_m2
-        independent_m4 = residual_m2**2 / MAX_STRETCHES + course.position_m2**2 / len(response_m)
-        moments[k] = mean_m2, 2 * (float(np.trace(shared @ shared)) + independent_m4)
-    mean_m2, variance_m4 = moments.mean(axis=0)
-    of_trials = 2 * moments[:, 0] ** 2 / moments[:, 1]
-    degrees = 2 * len(courses) * mean_m2**2 / variance_m4
-    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trials.mean())
+    mean_m2, degrees, of_trial = mean_square(courses, scatter)
+    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trial)
     return dict(zip(EXPECTED, (math.sqrt(mean_m2 * part) for part in (1.0, *ends)), strict=True))

@@ -36,8 +36,8 @@ else:
 
 @dataclass(frozen=True)
 class Confounder(JsonRecord):
-    """Another effect that a fitted size, of this `parameter` and vine, may include. Left free, it would have the 95 %
-    interval from `low_95` to `high_95`.
+    """Another effect that a fitted size, of this `parameter` and vine, may include: with any size of it that is not
+    excluded, the 95 % interval is from `low_95` to `high_95`.
     """
 
     parameter: str

@@ -9,7 +9,7 @@ is added: first single effects are tried, then sets of two to five. If no set pa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,12 +35,10 @@ from vinetrack.diagnosis.likelihood_ratio import (
     with_curves,
     without_curves,
 )
-from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
-    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     has_excess_scatter,
@@ -52,12 +50,12 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
 # ------------------------------------------------------------------------------
@@ -274,14 +272,9 @@ def adequate_hypotheses(
 #
 # Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent.
 # If another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
-# coefficient of omitted-variable bias of the linear fit (`Scores.levers`). The estimate of s from the
-# trajectories, N(ŝ, σ_s²), is combined with a normal prior centred on zero, scaled so that 95 % of it lies within the
-# farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis).
-# Effects are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the
-# one with the other effect left free: at least 95 %.
-
-
-TWO_SIDED_95 = 1.959964  # Derived: quantile of the normal distribution
+# coefficient of omitted-variable bias of the linear fit (`Scores.levers`). s may be anything up to its upper limit, or
+# to the end of its plausible range where that is nearer: the interval stated is the hull of the fit's own and of that
+# one shifted. Effects are considered one at a time and to first order.
 
 
 def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
@@ -299,88 +292,30 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
             # An effect that contains the added one as a limit is an alternative to it, no confounder.
             effect, sigma = shape.effect, float(after.scores.sigma[k])
             alternative = effect.kind != "physical" or name in effect.replaces
-            if not alternative and effect.parameters and not shape.whole and math.isfinite(sigma):
-                found = _in_shape(number, shape, float(after.scores.size[k]), sigma, float(lever[k]))
-                shift = abs(found.value - number.value)
-                # A shift of less than a standard error of the size is not reported (chosen)
-                if shift > largest.get(effect.name, (number.sigma, None))[0]:
-                    largest[effect.name] = shift, found
+            if alternative or not effect.parameters or shape.whole or not math.isfinite(sigma):
+                continue
+            possible = sizes_not_excluded(float(after.scores.size[k]), sigma, shape.size)
+            shifts = [-float(lever[k]) * size for size in possible]
+            most = max((0, 1), key=lambda end: abs(shifts[end]))
+            # A shift of less than a standard error of the size is not reported (chosen)
+            if abs(shifts[most]) > largest.get(effect.name, (number.sigma, None))[0]:
+                known = (number.key, number.vine, effect.name, shape.size.symbol, shape.size.unit)
+                ends = number.value + shifts[most], number.low + min(*shifts, 0.0), number.high + max(*shifts, 0.0)
+                values = np.clip(ends, number.lower, number.upper).tolist()
+                largest[effect.name] = abs(shifts[most]), Confounder(*known, shape.size.zero + possible[most], *values)
         # 3: confounders listed for each size (chosen)
         chosen += [found for _, found in sorted(largest.values(), key=lambda found: -found[0])[:3]]
     return tuple(chosen)
 
 
-def _in_shape(number: Number, shape: CandidateShape, size: float, sigma: float, lever: float) -> Confounder:
-    """One shape of an effect of such an estimated size as a confounder."""
-    mean, sd, limit = size_not_excluded(size, sigma, shape.size)
-    expected, quantile = number.value - lever * mean, 0.5 * (number.high - number.low) / number.sigma
-    half_width = max(quantile if math.isfinite(quantile) else 0.0, TWO_SIDED_95) * math.hypot(number.sigma, lever * sd)
-    return Confounder(
-        parameter=number.key,
-        vine=number.vine,
-        effect=shape.effect.name,
-        symbol=shape.size.symbol,
-        unit=shape.size.unit,
-        limit=shape.size.zero + limit,
-        value=min(max(number.value - lever * limit, number.lower), number.upper),
-        low_95=max(min(number.low, expected - half_width), number.lower),
-        high_95=min(max(number.high, expected + half_width), number.upper),
-    )
-
-
-def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
-    """Combine the estimate of a size with its plausible range (truncated normal posterior)."""
-    from scipy.stats import truncnorm
-
-    low, high = plausible_range(parameter)
-    prior_sd = max(abs(low - parameter.zero), abs(high - parameter.zero)) / TWO_SIDED_95
-    precision = 1 / sigma**2 + 1 / prior_sd**2
-    centre, width = estimate / sigma**2 / precision, 1 / math.sqrt(precision)
-    lower, upper = (-math.inf, math.inf)
-    if parameter.sign > 0:
-        lower = 0.0
-    elif parameter.sign < 0:
-        upper = 0.0
-    posterior = truncnorm((lower - centre) / width, (upper - centre) / width, loc=centre, scale=width)
-    ends = [float(posterior.ppf(share)) for share in (0.05, 0.95)]
-    return float(posterior.mean()), float(posterior.std()), max(ends, key=abs)
-
-
-# ------------------------------------------------------------------------------
-# Results of a diagnosis that contradict its verdict: errors on left-out conditions, and drifting parameters.
-#
-# The verdict rests on likelihoods. Two results are independent of it: how well left-out conditions are predicted, and
-# whether the best parameter values of single trials are the same under every condition. Where they disagree with the
-# verdict, notes report it.
-
-CONTRADICTING_DRIFT_SIGMAS = 4.0  # Significance of a drift from which it contradicts an adequate model (chosen)
-
-
-def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[Remark, ...]:
-    """List the results that contradict the final model of a diagnosis where the verdict calls it adequate. Returns
-    remarks; empty where nothing contradicts the verdict.
+def sizes_not_excluded(estimate: float, sigma: float, size: Parameter) -> tuple[float, float]:
+    """Ends of the sizes, from its absence, within two standard errors of an estimate, its plausible range, and the sign
+    that it may have.
     """
-    return (*_not_better(added, ladder), *_still_drifts(fits[-1]))
-
-
-def _not_better(added: Sequence[str], ladder: pd.DataFrame | None) -> Iterator[Remark]:
-    if ladder is None:
-        return
-    errors_m = [float(value) for value in ladder["rms_left_out_m"]]
-    for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False):
-        if math.isfinite(without_m + with_m) and with_m >= without_m:
-            yield remark("left_out_error_does_not_fall", name=name, without_m=without_m, with_m=with_m)
-
-
-def _still_drifts(fit: Fit) -> Iterator[Remark]:
-    try:
-        result = drift(fit)
-    except (FitError, SimulationError, np.linalg.LinAlgError):
-        return
-    table = result.table
-    sure = table[table["significant"] & (table["z"] > CONTRADICTING_DRIFT_SIGMAS)]
-    for line in sure.drop_duplicates(["parameter", "against"])["sentence"]:
-        yield remark("still_drifts", model=list(fit.model.names), drift=line)
+    low, high = (end - size.zero for end in plausible_range(size))
+    low, high = min(low, 0.0) * (size.sign <= 0), max(high, 0.0) * (size.sign >= 0)
+    # 2.0: standard errors of a 95 % interval (derived)
+    return min(max(estimate - 2.0 * sigma, low), high), min(max(estimate + 2.0 * sigma, low), high)
 
 
 # ------------------------------------------------------------------------------

@@ -103,15 +103,17 @@ def track_correlation(data: Sequence[FitTrial]) -> float:
     )
 
 
+TYPICAL_SPREADS = (0.01, 0.03)  # Usual standard deviations of pressure (relative) and ln B between trials (chosen)
+
+
 def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
     """Between-trial standard deviation of pressure as the sheet states it, and the typical one of ln B."""
-    first_spreads = (0.01, 0.03)  # Initial between-trial standard deviations of pressure (relative) and ln B (chosen)
     relative = [
         trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
         for trial_data in data
         if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
     ]
-    return (float(np.mean(relative)) if relative else first_spreads[0]), first_spreads[1]
+    return (float(np.mean(relative)) if relative else TYPICAL_SPREADS[0]), TYPICAL_SPREADS[1]
 
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:

@@ -20,7 +20,6 @@ from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
     expected_text,
-    odd_deciding_in_words,
     odd_in_words,
     percent,
     spaced_name,
@@ -309,28 +308,15 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame, numbers: pd.Da
 # Simple laws of a missing force.
 
 
-def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
-    """Describe a law of force with its size, and where along the motions it has this size."""
-    if law.kind == "periodic":
-        size = f"with an amplitude of {_force_text(math.hypot(*amplitude_N), sigma_N)}"
-    else:
-        size = f"{'+' if amplitude_N[0] > 0 else ''}{_force_text(amplitude_N[0], sigma_N)}".replace("-", "−")
-    by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
-    scale = law.shapes[0] if law.shapes else math.nan
-    facts = {
-        "size": size,
-        "times": f", times {by[law.factor]}" if law.factor else "",
-        "area": ", in proportion to the cross-section of the vine" if law.reference_area_m2 else "",
-        "milli": number(1e3 * scale),
-        "scale": f"{scale:.2g}",
-        "low": f"{1e3 * max(scale, 0.0):.0f}",
-        "high": f"{1e3 * sum(law.shapes):.0f}",
-    }
-    return sentence(f"law_{law.kind}", facts)
-
-
-def _force_text(value_N: float, sigma_N: float) -> str:
-    return f"{with_error(value_N, sigma_N)} N" if math.isfinite(sigma_N) else "any size"
+def law_text(law: Law, amplitude_N: float, sigma_N: float) -> str:
+    """Describe a law of force with its size at its largest."""
+    error = with_error(amplitude_N, sigma_N) if math.isfinite(sigma_N) else number(amplitude_N)
+    size = f"{'+' if amplitude_N > 0 else ''}{error} N".replace("-", "−")
+    return (
+        f"a force in proportion to {law.symbols}, {size} at its largest"
+        if law.factors
+        else f"a constant force of {size}"
+    )
 
 
 # ------------------------------------------------------------------------------
@@ -520,7 +506,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
     ),
     "odd_trials": odd_in_words,
-    "odd_trials_decide": odd_deciding_in_words,
     "deciding_measurements": measurement_text,
     "trials_to_make": advice_text,
     "law": law_text,

@@ -109,8 +109,7 @@ def verdict_line(diagnosis: Diagnosis) -> str:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence; what contradicts the sheet in its place, since any verdict rests on it."""
     told = _told(diagnosis, spaced_name)
-    begins_with_name = diagnosis.contradicted_columns or diagnosis.odd_trials
-    return f"{told if begins_with_name else told[0].upper() + told[1:]}."
+    return f"{told if diagnosis.contradicted_columns else told[0].upper() + told[1:]}."
 
 
 def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
@@ -118,9 +117,6 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
     names = [shown(name) for name in (diagnosis.effects if verdict == MISSING else ()) or answers]
     if diagnosis.contradicted_columns:
         return f"{joined(diagnosis.contradicted_columns)} in the sheet cannot fit the measurements: correct it first"
-    if diagnosis.odd_trials:
-        are = "is" if len(diagnosis.odd_trials) == 1 else "are"
-        return f"{joined(diagnosis.odd_trials)} {are} inconsistent with the others, which the model explains"
     if answers == (DROPPED_FRAMES,):
         return "frames are missing from the recordings"
     if verdict == ARTEFACT and trials_differ(answers):
@@ -139,7 +135,8 @@ def verdict_table(diagnosis: Diagnosis) -> list[Row]:
     """Return the verdict as rows: what is missing, how sure, how large, the damping law, what it could be instead,
     what cannot be excluded, and what to do now. A row without an answer is left out.
     """
-    rows = [Row("What is missing", verdict_sentence(diagnosis), _thereafter(diagnosis))]
+    odd = f"Without {joined(diagnosis.odd_trials)}, inconsistent with the others. " if diagnosis.odd_trials else ""
+    rows = [Row("What is missing", verdict_sentence(diagnosis), f"{odd}{_thereafter(diagnosis)}".rstrip())]
     if diagnosis.verdict and not diagnosis.contradicted_columns:
         rows += [
             Row("How sure", *_how_sure(diagnosis)),
@@ -502,13 +499,3 @@ def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     pressures = [f" {name} moves as at {implied}, but {stated} is stated." for name, (implied, stated) in told.items()]
     facts = {"names": [trial.name for trial in odd], "others": count - len(odd), "pressures": "".join(pressures)}
     return sentence("are_odd", facts)
-
-
-def odd_deciding_in_words(
-    odd: Sequence[OddTrial], count: int, others: Diagnosis, with_them: str, withdrawn: bool
-) -> str:
-    """Return the explanation where the verdict rests on trials that are inconsistent with the others."""
-    names = joined([trial.name for trial in odd])
-    text = f"{odd_in_words(odd, count)} Without {names} the verdict is `{others.verdict}`: {others.explanation}"
-    rests = " the verdict would rest on these alone." if withdrawn else ""
-    return f"{text} With {names}:{rests} {with_them}"

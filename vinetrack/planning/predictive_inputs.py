@@ -25,6 +25,7 @@ from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
+from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.planning import printed_law
 
 if TYPE_CHECKING:
@@ -497,8 +498,7 @@ class _Assembly:
 
     def between_trials(self) -> tuple[float, float]:
         """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
-        # Relative between-trial standard deviations of pressure and B (chosen)
-        pressure, damping, origin = 0.01, 0.03, "assumed"
+        (pressure, damping), origin = TYPICAL_SPREADS, "assumed"
         trial, dof = self.trial, {"P": math.inf, "B": math.inf}
         if trial.pressure_Pa > 0 and math.isfinite(trial.pressure_sigma_Pa):
             pressure = trial.pressure_sigma_Pa / trial.pressure_Pa
