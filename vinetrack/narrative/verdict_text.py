@@ -33,8 +33,8 @@ from vinetrack.narrative import sentence
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.diagnose import OddTrial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-    from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 
