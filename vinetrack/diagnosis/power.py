@@ -152,7 +152,6 @@ class FurtherTrials(JsonRecord):
     unlimited: Annotated[float, Field(alias="probability_endless")] = math.nan
     n_conditions: Annotated[int, Field(alias="conditions_looked_at")] = 0
     trials: tuple[Mapping[str, Any], ...] = ()
-    needed: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def after(self) -> float:
