@@ -25,7 +25,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials
+from vinetrack.diagnosis.result import EffectPower, FurtherTrials
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.missing_force import Law, LearnedForce
-    from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
+    from vinetrack.diagnosis.result import EffectPower, FurtherTrials, Power
     from vinetrack.inference.fit_result import Fit
     from vinetrack.planning.predictive_inputs import Band
 
