@@ -39,7 +39,7 @@ from hidden.shots import Campaign, Laboratory, Shot, careful, film, plan
 from scipy.stats import binomtest
 
 import vinetrack as vt
-from vinetrack.diagnosis.power import EffectPower
+from vinetrack.diagnosis.result import EffectPower
 
 FIRST_TUNING_SEED, FIRST_SCORING_SEED = 21_000, 31_500
 DESIGNS = {"six": (1, (6, 6)), "twenty_four": (1, (18, 26)), "two_vines": (2, (40, 48))}

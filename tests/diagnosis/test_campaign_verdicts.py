@@ -25,11 +25,10 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
-from vinetrack.diagnosis.diagnose import not_better
+from vinetrack.diagnosis.diagnose import not_better, with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
-from vinetrack.diagnosis.replicates import with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.schema import with_names

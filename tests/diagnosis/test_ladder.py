@@ -15,10 +15,18 @@ from vinetrack.core.records import Trial
 from vinetrack.diagnosis import between_trials, diagnose, result
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.between_trials import Difference, between_fits, confounded, differences, significant
-from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
+from vinetrack.diagnosis.ladder import (
+    Errors,
+    align_trials,
+    compare,
+    excess,
+    highest_pressure,
+    in_sample,
+    ladder,
+    left_out,
+)
 from vinetrack.diagnosis.likelihood_ratio import robust_ratio
 from vinetrack.diagnosis.locate import drift, locate, per_trial_estimates
-from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.experiment.schema import with_names

@@ -14,9 +14,9 @@ import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import force_inversion as inversion
 from vinetrack.diagnosis import missing_force as learning
+from vinetrack.diagnosis.ladder import align_trials
 from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_text
-from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference import gaussian_processes as smooth

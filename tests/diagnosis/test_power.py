@@ -15,7 +15,7 @@ from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import further_trials as advice
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.linear_power import planned_tests
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
+from vinetrack.diagnosis.result import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow

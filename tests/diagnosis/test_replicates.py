@@ -10,9 +10,8 @@ from lsoda_vine import B_TRUE, as_track, filmed, grown_position, small_campaign,
 
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.diagnosis.diagnose import diagnose
-from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors
-from vinetrack.diagnosis.replicates import odd_trials, replicates_of
+from vinetrack.diagnosis.diagnose import diagnose, odd_trials
+from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors, replicates_of
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import TrialFit
@@ -186,7 +185,7 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
     given = {"middle_speed": lambda data: data.speed, "_force_N": lambda trial, _: trial.force_N}
     given["CHANCE"] = 1e-2
     for name, value in given.items():
-        monkeypatch.setattr(f"vinetrack.diagnosis.replicates.{name}", value)
+        monkeypatch.setattr(f"vinetrack.diagnosis.diagnose.{name}", value)
     draw, campaigns_with_odd = np.random.default_rng(20050), 0
     for _ in range(150):
         log_speed = draw.uniform(0, 1.5, 24)

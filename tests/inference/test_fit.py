@@ -15,9 +15,8 @@ from vine_truth import Vine, record
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis import misfit_tests as hypotheses
-from vinetrack.diagnosis.ladder import candidates_of
+from vinetrack.diagnosis.ladder import candidates_of, first_that_counts
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
-from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset, predict_prepared

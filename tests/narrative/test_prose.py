@@ -11,8 +11,16 @@ from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
-from vinetrack.diagnosis.result import VERDICTS, Diagnosis
+from vinetrack.diagnosis.result import (
+    PROBABILITIES,
+    VERDICTS,
+    Diagnosis,
+    EffectPower,
+    FurtherTrials,
+    NumberWidth,
+    Power,
+    PowerInput,
+)
 from vinetrack.narrative import templates
 from vinetrack.narrative.diagnosis_text import REMARKS, further_lines
 from vinetrack.narrative.verdict_text import verdict_sentence

@@ -15,8 +15,7 @@ from chrome import Chrome, find_chrome
 from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, number
 from PIL import Image
 
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
-from vinetrack.diagnosis.result import Candidate, Diagnosis
+from vinetrack.diagnosis.result import PROBABILITIES, Candidate, Diagnosis, EffectPower, Power
 from vinetrack.effects import catalogue
 from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, figures_of

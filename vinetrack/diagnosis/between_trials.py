@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.ladder import within_groups
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, full_fit, likelihood_ratio
-from vinetrack.diagnosis.replicates import within_groups
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order

@@ -5,8 +5,9 @@ diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,20 +15,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import Remark, in_words, remark
-from vinetrack.core.records import Track
+from vinetrack.core.records import Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
-from vinetrack.diagnosis.replicates import lost_frames, odd_trials, with_lost_frames
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN_TRIALS,
     CONTAINS,
+    DROPPED_FRAMES,
     NOT_TESTABLE,
     REFITTED,
     SCREENED,
@@ -41,10 +43,11 @@ from vinetrack.diagnosis.selection import Report, SelectionStep, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
-from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.tracks.frame_timing import correct_frames, longer_than_stated
+from vinetrack.inference.sensitivity import middle_speed
+from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing, longer_than_stated
 from vinetrack.tracks.position_noise import rejected_points_note
 
 if TYPE_CHECKING:
@@ -125,7 +128,7 @@ def _far_off(fit: Fit) -> dict[str, float]:
     far_off = (missed > LARGEST_MISSED) | beside_others
     if np.mean(far_off) > 0.5:
         return {}
-    return {data[i].trial.name: float(missed[i]) for i in np.flatnonzero(far_off)}
+    return {data[i].trial.name: float(missed[i]) for i in np.flatnonzero(far_off).tolist()}
 
 
 def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Diagnosis:
@@ -323,3 +326,120 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
         learned_table=learned,
         explanation=explanation if force.learned is None else f"{explanation} {force.learned.sentence}",
     )
+
+
+# ------------------------------------------------------------------------------
+# Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
+#
+# One such trial among thirty causes a misfit that no effect explains: it is left out and named. Outliers are detected
+# without the model that failed: over the middle of the growth damping roughly balances the force,
+#
+#     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
+#
+# with a curvature c for a force of another power of speed. The residual of a trial from a robust fit of these curves is
+# compared with the residuals of the others. An effect that the model lacks changes all trials of a condition alike; a
+# pressure with its digits swapped does not.
+
+CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
+FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
+
+
+@dataclass(frozen=True)
+class OddTrial:
+    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa, and the unit of the
+    sheet. `implied_pressure_Pa` is NaN where it is not known.
+    """
+
+    name: str
+    stated_Pa: float
+    implied_pressure_Pa: float
+    unit: str = "kPa"
+
+
+def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
+    """Find trials whose speed contradicts the sheet although the other trials agree with it."""
+    from scipy.optimize import least_squares
+    from scipy.stats import t as student
+
+    trials = [trial_data.trial for trial_data in data]
+    if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
+        return []
+    stated_Pa = [trial_data.typical_pressure_Pa for trial_data in data]
+    force_N = np.array([_force_N(*pair) for pair in zip(trials, stated_Pa, strict=True)])
+    of_vine = np.array([trial.vine for trial in trials])
+    vines = np.unique(of_vine)
+    # 2: slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
+    remaining = len(data) - vines.size - 2
+    if remaining < 1:
+        return []
+    # A trial that its stated force could not move lies far off every curve.
+    log_force = np.log(np.maximum(force_N, 1e-9))
+    log_speed = np.log([middle_speed(trial_data) for trial_data in data])
+    log_speed -= np.median(log_speed)
+    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
+    usual_exponent = 0.37  # Starting value of the exponent (PHYSICS)
+    straight = log_force - usual_exponent * log_speed
+    levels = [float(np.median(straight[of_vine == vine])) for vine in vines]
+    # 0.05: residual of ln F at which the robust fit (Cauchy loss) halves the weight of a trial (chosen)
+    fitted = least_squares(
+        lambda values: log_force - curves @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
+    )
+    residual = log_force - curves @ fitted.x
+    # Fitted curves follow the trials: the scatter about them is smaller by the degrees of freedom that they take.
+    median_deviation = float(np.median(np.abs(residual))) / 0.6745
+    # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
+    scatter = max(median_deviation * math.sqrt(len(data) / remaining), 0.02)
+    # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
+    # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
+    allowed = scatter * float(student.isf(CHANCE / (2 * len(data)), max(0.37 * remaining + 1.0, 3.0)))
+    replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
+             for k, trial in enumerate(trials)]  # fmt: skip
+    # Where a replicate deviates as much, the cause is physics of the condition.
+    odd = [
+        k
+        for k in np.flatnonzero(np.abs(residual) > allowed).tolist()
+        if all(abs(residual[j]) < allowed < abs(residual[k] - residual[j]) for j in replicates[k])
+    ]
+    # 0.125: the largest fraction that may be outliers (chosen)
+    if len(odd) > max(2, int(0.125 * len(data))):
+        return []
+    lacking_Pa = [(np.exp(curves[k] @ fitted.x) - force_N[k]) / trials[k].area_m2 for k in odd]
+    return [
+        OddTrial(trials[k].name, stated_Pa[k], stated_Pa[k] + float(lacks), trials[k].pressure_unit)
+        for k, lacks in zip(odd, lacking_Pa, strict=True)
+    ]
+
+
+def _force_N(trial: Trial, pressure_Pa: float) -> float:
+    """Twice the driving force on the tip: pressure above the yield pressure, and weight; as in `kinematics.force`."""
+    middle_m = np.array([0.25 * np.nan_to_num(trial.length_m)])
+    mass_kg = float(np.nan_to_num(trial.moving_mass_kg(middle_m))[0])
+    weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
+    return (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
+
+
+# ------------------------------------------------------------------------------
+# Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
+
+
+def lost_frames(pairs: Pairs) -> dict[str, bool]:
+    """Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain."""
+    return {
+        trial.name: frames_surely_missing(track) for trial, track in pairs if with_flag(track.flag, "retimed").any()
+    }
+
+
+def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
+    """Put certain dropped frames first in a diagnosis, and its verdict with corrected times into a note. A jump that a
+    few outlying points may have caused becomes a note only.
+    """
+    if not lost:
+        return result
+    if not any(lost.values()):
+        return replace(result, notes=(*result.notes, remark("frames_perhaps_missing", trials=tuple(lost))))
+    note = remark("with_corrected_times", verdict=result.verdict, explanation=result.explanation)
+    words = str(remark("frames_missing", trials=tuple(lost)))
+    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
+    only = replace(result.rounds[0], explanation=words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,), **nothing)
+    alone = replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
+    return replace(alone, notes=(note,), odd_trials=())

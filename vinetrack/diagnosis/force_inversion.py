@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import LEAST_SCATTER, align_trials
+from vinetrack.diagnosis.ladder import LEAST_SCATTER, align_trials
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial

@@ -25,7 +25,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials
+from vinetrack.diagnosis.result import EffectPower, FurtherTrials
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
@@ -388,7 +388,7 @@ def further_trials(
     """Find the fewest further trials that give an effect of some size a target power; `tests` are of those so far."""
     limits, trials = limits or Limits(), [trial.trial for trial in tests.fit.trials]
     # 48: most further trials considered where `limits.trials` is not stated (chosen)
-    most = (limits.trials if "trials" in limits.model_fields_set else 48) // REPLICATES
+    most = whole = (limits.trials if "trials" in limits.model_fields_set else 48) // REPLICATES
     before = now.probability_at(value)
     plan = FurtherTrials(now, value, target, before, before)
     if before >= target:
@@ -412,10 +412,8 @@ def further_trials(
         known = {v: information(np.flatnonzero(vines == v).tolist(), times=UNLIMITED)[0] for v in vines[places]}
         return [max(known, key=lambda vine: known[vine])]
 
-    effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-    chosen, needed = list[int](), dict[str, int]()
-    power: Callable[[int], EffectPower] = cache(lambda _: now)
-    for effort, allowed in conditions_by_effort(conditions, best_vine):
+    chosen, power = list[int](), cache(lambda _: now)
+    for _, allowed in conditions_by_effort(conditions, best_vine):
         pairs = added_one_by_one(allowed, information, most)
         if not pairs:
             continue
@@ -423,18 +421,17 @@ def further_trials(
         short = len(pairs)  # How many of these pairs fall short of the target
         if with_pairs(short).probability_at(value) >= target:
             short = bisect_left(range(1, short), target, key=lambda count: with_pairs(count).probability_at(value))
-        if short < len(pairs):
-            # With more effort only fewer trials are worth it.
-            most, needed[effort_words[effort]] = short, REPLICATES * (short + 1)
-        if short < len(pairs) or not needed:
+        if short < len(pairs) or most == whole:
             chosen, power = pairs[: short + 1], with_pairs
+        if short < len(pairs):
+            most = short  # With more effort only fewer trials are worth it.
     made: list[dict[str, Any]] = []
     for k, place in enumerate(chosen, 1):
         cells = _entry(conditions[place], "yield_pressure_kPa", "capture_fps")
         known = {name: cell for name, cell in cells.items() if cell == cell}  # NaN is not equal to itself
         made += [{**known, "probability": power(k).probability_at(value)}] * REPLICATES
     final = power(len(chosen))
-    plan = replace(plan, power=final, trials=tuple(made), needed=needed, n_conditions=len(films))
+    plan = replace(plan, power=final, trials=tuple(made), n_conditions=len(films))
     endless, so_many = information(range(len(films)), times=UNLIMITED)[0], information(chosen)[0]
     away = math.sqrt(endless / max(so_many, 1e-300)) * (value - final.zero)
     return replace(plan, unlimited=max(final.probability_at(final.zero + away), plan.after))

@@ -1,10 +1,11 @@
-"""The ladder of errors: in-sample and out-of-sample errors of each model as effects are added.
+"""The ladder of errors: of each model as effects are added, in sample and out of it, beside those of replicates.
 
-All errors are those of `vinetrack.diagnosis.ladder`: each trial has its own release and origin and no other trial
-effect, the origin is the position at standstill, and every trial has the same weight. They differ in the data of the
-fit: all trials; all but the condition predicted, each in turn (leave-one-condition-out cross-validation); all but the
-highest pressure of each vine. The floor is the scatter of replicates. Where it dominates, the error hardly falls as the
-model improves, but the excess √(rms² − floor²) does.
+Each trial has its own release and origin and no other trial effect, the origin is the position at standstill, and every
+trial has the same weight. Errors differ in the data of the fit: all trials; all but the condition predicted, each in
+turn (leave-one-condition-out cross-validation); all but the highest pressure of each vine. What distinguishes
+replicates so laid on a model is their scatter, the floor below which no model can fall. Two trials of a condition tell
+little about it; all of them tell by what multiple of a typical scatter of pressure and of B they differ, and the
+sensitivities of the trajectories spread it over the conditions.
 """
 
 from __future__ import annotations
@@ -14,33 +15,29 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Kinematics, Track
+from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.terminal import plot, table
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import number
-from vinetrack.diagnosis.replicates import (
-    AlignedTrials,
-    Replicates,
-    align_trials,
-    expected_error,
-    first_that_counts,
-    replicates_by_condition,
-)
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.fit import fit, fit_subset, predict_prepared
+from vinetrack.inference.fit import aligned_to_trials, fit, fit_subset, predict_prepared, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
-from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.optimiser import TYPICAL_SPREADS
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
 from vinetrack.kinematics.summary import lead_velocity_at
 from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.tracks.position_noise import rest_points
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,6 +79,224 @@ def initial_fit(
 ) -> Fit:
     """Fit the model in use, as the diagnosis does."""
     return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile)
+
+
+# ------------------------------------------------------------------------------
+# The trials of one condition, each laid on the model by its own release and origin.
+
+
+def within_groups(
+    values: Floats, groups: Sequence[str] | NDArray[np.str_], weight: Floats | float = 1.0
+) -> tuple[Floats, int]:
+    """Deviations from the weighted mean of each group, and their degrees of freedom. Shapes: values (n, …)."""
+    names, group = np.unique(groups, return_inverse=True)
+    shares = np.where(group == np.arange(names.size)[:, None], weight, 0.0)
+    means = (shares / shares.sum(axis=1, keepdims=True)) @ values
+    return np.asarray(values - means[group]), len(group) - names.size
+
+
+@dataclass(frozen=True)
+class Replicates:
+    """Trials of one condition: all `frames`, since release and from the origin, with the mean of the replicates then
+    and their standard deviation; and the mean and variance of the residuals, measurement minus model, at `instants` one
+    frame apart, with the number of trials present and whether any of them has begun to move.
+    """
+
+    trials: Sequence[TrialFit]
+    frames: pd.DataFrame
+    instants: pd.DataFrame
+
+    @property
+    def floor_m(self) -> float:
+        """Replicate floor: rms deviation of a replicate from the mean of infinitely many; NaN for one trial alone."""
+        use = self.instants[self.instants["moves"] & (self.instants["present"] > 1)]
+        return math.sqrt(np.average(use["variance_m2"], weights=use["present"])) if len(use) else math.nan
+
+
+def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
+    """Residuals of a model for the trials of one condition at common times. A frame counts at the instant nearest to
+    it: interpolation would average the noise of positions away, and positions, other than residuals, change by much
+    more than their noise within half a frame.
+    """
+    import pandas as pd
+
+    step_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
+    parts = [
+        pd.DataFrame(
+            {
+                "trial": trial.name,
+                "time_s": trial.time_s - trial.release_s,
+                "lead_position_m": trial.lead_position_m - trial.origin_m,
+                "model_position_m": trial.predicted_position_m - trial.origin_m,
+                "residual_m": trial.residual_m,
+                "moves": np.arange(trial.time_s.size) >= first_that_counts(trial),
+            }
+        )
+        for trial in trials
+    ]
+    frames = pd.concat(parts, ignore_index=True)
+    instant = np.rint(frames["time_s"] / step_s)
+    residual_m = frames.pivot_table("residual_m", instant, "trial")
+    of_instant = frames.groupby(instant)
+    instants = pd.DataFrame(
+        {
+            "time_s": step_s * residual_m.index,
+            "lead_position_m": of_instant["lead_position_m"].mean(),
+            "mean_m": residual_m.mean(axis=1),
+            "variance_m2": residual_m.var(axis=1),
+            "present": residual_m.count(axis=1),
+            "moves": of_instant["moves"].any(),
+        }
+    )
+    at = instants.loc[instant]
+    frames["replicates_mean_m"] = frames["model_position_m"] + at["mean_m"].to_numpy()
+    frames["replicates_sigma_m"] = np.sqrt(at["variance_m2"].to_numpy())
+    return Replicates(trials, frames.drop(columns=["residual_m", "moves"]), instants)
+
+
+def replicates_by_condition(trials: Sequence[TrialFit]) -> dict[str, Replicates]:
+    """The replicates of each condition, in order."""
+    names = dict.fromkeys(trial.trial.condition for trial in trials)
+    return {name: replicates_of([trial for trial in trials if trial.trial.condition == name]) for name in names}
+
+
+def first_that_counts(trial: TrialFit) -> int:
+    """Index of the frame where model or measurement begins to move: a standstill would only dilute an error."""
+    released = int(np.searchsorted(trial.time_s, trial.release_s))
+    # While the pressure is still rising, nothing moves yet.
+    moved = np.flatnonzero(trial.predicted_position_m > trial.origin_m)
+    released = max(released, int(moved[0]) if moved.size else trial.time_s.size)
+    at_rest = rest_points(trial.lead_position_m)  # all of them where nothing moved
+    at_rest = at_rest if at_rest < trial.time_s.size else 0
+    return min(released, max(at_rest - 1, 0), trial.time_s.size - 1)
+
+
+# ------------------------------------------------------------------------------
+# How far trials scatter: by what multiple of a typical scatter of pressure and of B, as replicates show it.
+
+LEAST_SCATTER = 0.5  # Least scatter of trials, in multiples of the typical one, where it is needed (chosen)
+
+
+@dataclass(frozen=True)
+class AlignedTrials:
+    """A fitted model aligned with its trials: each has its own release and origin, but no deviation of pressure or B.
+    `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`; `trials` are those predicted.
+    """
+
+    fit: Fit
+    predictor: Predictor
+    trial_effects: Floats
+    columns: tuple[Floats, ...]
+    trials: Sequence[TrialFit]
+
+    @cached_property
+    def courses(self) -> dict[str, list[ResidualCourse]]:
+        """Residuals of the trials of each condition, by its name, in order."""
+        courses: dict[str, list[ResidualCourse]] = {}
+        for i, trial in enumerate(self.trials):
+            courses.setdefault(trial.trial.condition, []).append(_course(self, i, trial))
+        return courses
+
+    @cached_property
+    def scatter(self) -> Scatter:
+        """The multiple of the typical scatter at which an adequate model would be off by the replicate floor."""
+        together, beyond, typical, dof = replicates_by_condition(self.trials), 0.0, 0.0, 0
+        for condition, members in self.courses.items():
+            if not math.isnan(floor_m := together[condition].floor_m):
+                beyond += sum(floor_m**2 - member.position_m2 for member in members)
+                typical += sum(float(np.trace(member.typical_m2)) for member in members)
+                dof += len(members) - 1
+        return Scatter(math.sqrt(max(beyond, 0.0) / max(typical, 1e-300)), dof) if dof else Scatter(1.0, 0)
+
+    def nuisances(self, i: int) -> list[int]:
+        """Columns of release and, where no standstill was seen, origin of one trial."""
+        return [RELEASE] if rest_is_seen(self.predictor.data[i : i + 1])[0] else [RELEASE, ORIGIN]
+
+
+def align_trials(fit: Fit) -> AlignedTrials:
+    """Align the model with the trials that it was fitted to, by release and origin."""
+    predictor, trial_effects, trials = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
+    columns = tuple(predictor.linearise(np.empty(0), trial_effects))
+    return AlignedTrials(fit, predictor, trial_effects, columns, trials)
+
+
+def orthogonal_part(columns: Floats, others: Floats) -> Floats:
+    """Component of columns that is orthogonal to all linear combinations of others. Shapes: columns (n_points, …);
+    others (n_points, n) → (n_points, …).
+    """
+    return np.asarray(columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0])
+
+
+class ResidualCourse(NamedTuple):
+    """One trial from its first motion on, arrays of shape (n_points, …): residual; response to one typical standard
+    deviation of pressure and of ln B, (n_points, 2); place along the growth; variance of a position by its own errors.
+    """
+
+    trial: Trial
+    residual_m: Floats
+    response_m: Floats
+    lead_position_m: Floats
+    position_m2: float
+
+    @property
+    def typical_m2(self) -> Floats:
+        """Covariance by time of what typical deviations do, m²; its trace is their mean square. Shape (2, 2)."""
+        return np.asarray(self.response_m.T @ self.response_m / len(self.response_m))
+
+
+def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
+    """The course of one trial. Responses are orthogonal to those to release and origin. Where growth has ended in the
+    model they would be zero, but the vine may still grow: the last values are kept.
+    """
+    trial_data, columns = aligned.predictor.data[i], aligned.columns[i].copy()
+    moving = np.flatnonzero(columns[:, RELEASE] != 0)
+    if moving.size:
+        kept = [RELEASE, PRESSURE, DAMPING_DEVIATION]
+        columns[moving[-1] + 1 :, kept] = columns[moving[-1], kept]
+    response = orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], columns[:, aligned.nuisances(i)])
+    moved = slice(first_that_counts(trial), None)
+    return ResidualCourse(
+        trial=trial.trial,
+        residual_m=trial.residual_m[moved],
+        response_m=response[moved] * TYPICAL_SPREADS,
+        lead_position_m=trial.predicted_position_m[moved] - trial.origin_m,
+        position_m2=trial_data.mean_noise_m**2 + trial_data.position_systematic_m**2,
+    )
+
+
+class Scatter(NamedTuple):
+    """Scatter of trials in multiples of a typical one, and the replicates beyond the first of each condition that it
+    was found from; where there are none, the typical one.
+    """
+
+    multiple: float
+    dof: int
+
+
+def mean_square(courses: Sequence[ResidualCourse], scatter: Scatter) -> tuple[float, float, float]:
+    """Mean square error of an adequate model over trials of equal weight that scatter like replicates, m², its degrees
+    of freedom (Satterthwaite), and those of a single trial. That of a trial, S u + e with u ~ N(0, Σ), has the variance
+    2 tr((ΣSᵀS/n)²).
+    """
+    shared = [scatter.multiple**2 * course.typical_m2 for course in courses]
+    mean_m2 = np.array([np.trace(of) + one.position_m2 for of, one in zip(shared, courses, strict=True)])
+    by_position = [one.position_m2**2 / len(one.residual_m) for one in courses]
+    variance_m4 = 2 * (np.array([np.trace(of @ of) for of in shared]) + by_position)
+    degrees = 2 * float(np.sum(mean_m2)) ** 2 / float(np.sum(variance_m4))
+    return float(np.mean(mean_m2)), degrees, float(np.mean(2 * mean_m2**2 / variance_m4))
+
+
+def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
+    """Error of an adequate model over these trials, rms, m, and the ends of its 95 % range; NaN without replicates. As
+    many degrees of freedom as a trial has, so many has every replicate: the range is of F.
+    """
+    from scipy.stats import f as fisher
+
+    if not scatter.dof:
+        return dict.fromkeys(EXPECTED, math.nan)
+    mean_m2, degrees, of_trial = mean_square(courses, scatter)
+    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trial)
+    return dict(zip(EXPECTED, (math.sqrt(mean_m2 * part) for part in (1.0, *ends)), strict=True))
 
 
 # ------------------------------------------------------------------------------

@@ -39,8 +39,15 @@ from vinetrack.diagnosis.misfit_tests import (
     scores_of,
     testable,
 )
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput, SimulatedRates
-from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.diagnosis.result import (
+    ADEQUATE,
+    PROBABILITIES,
+    EffectPower,
+    NumberWidth,
+    Power,
+    PowerInput,
+    SimulatedRates,
+)
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.effects import Effect, EffectError

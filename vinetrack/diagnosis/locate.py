@@ -2,7 +2,7 @@
 
 By condition; along the growth; and by which parameter drifts with a condition on which it should not
 depend. A prediction has its own release and origin and no other trial effect, as in `vinetrack.diagnosis.ladder`.
-Standard errors are those of the mean over trials, from the scatter of replicates (`vinetrack.diagnosis.replicates`): a
+Standard errors are those of the mean over trials, from the scatter of replicates (`vinetrack.diagnosis.ladder`): a
 thousand frames of one trial are one trial.
 """
 
@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.ladder import excess, position_errors
-from vinetrack.diagnosis.replicates import (
+from vinetrack.diagnosis.ladder import (
     AlignedTrials,
     Replicates,
     ResidualCourse,
     Scatter,
     align_trials,
+    excess,
     mean_square,
     orthogonal_part,
+    position_errors,
     replicates_by_condition,
     within_groups,
 )
@@ -39,7 +40,7 @@ from vinetrack.inference.errors import robust_variances
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -264,8 +265,6 @@ def _tested(
 # ------------------------------------------------------------------------------
 # B of each trial, with all other parameters at their common values.
 
-MAX_DEVIATION = 3.0  # Largest deviation of ln B from the common value (chosen)
-
 
 @dataclass(frozen=True)
 class PerTrialEstimates:
@@ -284,40 +283,26 @@ class PerTrialEstimates:
 
 
 def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
-    """Fit B to each trial by least squares of position, with its release free."""
-    predictor, data = aligned.predictor, aligned.predictor.data
-    nuisances = [aligned.nuisances(i) for i in range(len(data))]
-    trial_effects, columns = aligned.trial_effects.copy(), aligned.columns
-    # 0.3, 2.0: largest step of ln B, and of the release, frames (chosen)
-    limits = {DAMPING_DEVIATION: 0.3, ORIGIN: math.inf}
-    # 5: Gauss–Newton steps (chosen)
-    for _ in range(5):
-        for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
-            free = [DAMPING_DEVIATION, *others]
-            most = [limits.get(place, 2.0 * data[i].frame_s) for place in free]
-            step = np.linalg.lstsq(of_trial[:, free], of_trial[:, -1], rcond=1e-9)[0]
-            trial_effects[i, free] += np.clip(step, np.negative(most), most)
-        of_B = trial_effects[:, DAMPING_DEVIATION]
-        trial_effects[:, DAMPING_DEVIATION] = np.clip(of_B, -MAX_DEVIATION, MAX_DEVIATION)
-        columns = tuple(predictor.linearise(np.empty(0), trial_effects))
-    response, variance = np.empty(len(data)), np.empty(len(data))
-    for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
-        sensitivity = orthogonal_part(of_trial[:, DAMPING_DEVIATION], of_trial[:, others])
-        response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
-        deviations = aligned.columns[i][:, [PRESSURE, DAMPING_DEVIATION]]
-        levers = sensitivity @ orthogonal_part(deviations, aligned.columns[i][:, others]) / response[i]
-        scatter = float(np.sum((TYPICAL_SPREADS * levers) ** 2))
-        variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
-    known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
-    known &= np.abs(trial_effects[:, DAMPING_DEVIATION]) < 0.99 * MAX_DEVIATION
+    """Ln B of each trial by least squares of position, with its release free, about the common value."""
+    data = aligned.predictor.data
+    deviation, variance = np.full(len(data), math.nan), np.empty(len(data))
+    for i, columns in enumerate(aligned.columns):
+        others = columns[:, aligned.nuisances(i)]
+        sensitivity = orthogonal_part(columns[:, DAMPING_DEVIATION], others)
+        response = max(float(np.sum(sensitivity**2)), 1e-300)
+        levers = sensitivity @ orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], others) / response
+        variance[i] = np.sum(np.square(TYPICAL_SPREADS * levers)) + data[i].mean_noise_m ** 2 / response + 1e-12
+        # 1e-12: least response of a trial, relative to its travel, from which it tells its B (derived)
+        if response > 1e-12 * float(np.ptp(data[i].lead_position_m)) ** 2 * len(columns):
+            deviation[i] = sensitivity @ columns[:, -1] / response
     number, trials = next(each for each in fit.numbers if each.key == DAMPING), tuple(each.trial for each in data)
     return PerTrialEstimates(
         number=number,
         trials=trials,
         vines=np.array([trial.vine if number.vine else "" for trial in trials]),
         conditions=np.array([trial.condition for trial in trials]),
-        base=predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
-        deviation=np.where(known, trial_effects[:, DAMPING_DEVIATION], np.nan),
+        base=aligned.predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
+        deviation=deviation,
         variance=variance,
     )
 

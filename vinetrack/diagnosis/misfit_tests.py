@@ -26,7 +26,7 @@ from scipy.special import ndtri
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.replicates import within_groups
+from vinetrack.diagnosis.ladder import within_groups
 from vinetrack.dynamics.model import Model, check_needs, probe, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from vinetrack.diagnosis.power import Power
+    from vinetrack.diagnosis.result import Power
     from vinetrack.planning.prediction import Choice, VinePrediction
 
 _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis

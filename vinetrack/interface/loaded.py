@@ -21,8 +21,7 @@ from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import Printed, plot
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.ladder import compare as compare_pairs
-from vinetrack.diagnosis.power import Power
-from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.diagnosis.result import Diagnosis, Power
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import (

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.missing_force import Law, LearnedForce
-    from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
+    from vinetrack.diagnosis.result import EffectPower, FurtherTrials, Power
     from vinetrack.inference.fit_result import Fit
     from vinetrack.planning.predictive_inputs import Band
 
@@ -132,15 +132,6 @@ def further_lines(plan: FurtherTrials) -> list[str]:
             lines.append(sentence("no_number_suffices", {"count": plan.n_conditions, "power": plan.unlimited}))
         else:
             lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.unlimited)} power.")
-    changes = {"with a new vine"} if any(trial["new_vine"] for trial in plan.trials) else set()
-    changes |= {"with another rig"} if any(trial["changed"] for trial in plan.trials) else set()
-    alternatives = [
-        f"{words} about {needed}"
-        for words, needed in plan.needed.items()
-        if changes and words not in changes and needed >= count
-    ]
-    if plan.is_reached and alternatives:
-        lines.append(f"Without these changes: {', '.join(alternatives)} trials.")
     if power.taken_for:
         names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:3]]
         lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
-from vinetrack.diagnosis.between_trials import BETWEEN, N_BY_VINE, ORDER_DRIFT, SPECIMEN
+from vinetrack.diagnosis.between_trials import BETWEEN, ORDER_DRIFT, SPECIMEN
 from vinetrack.diagnosis.misfit_tests import slip_of
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -33,8 +33,8 @@ from vinetrack.narrative import sentence
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.diagnose import OddTrial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-    from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 
@@ -48,8 +48,10 @@ def trials_differ(names: Sequence[str]) -> bool:
     return bool(names) and all(name in BETWEEN for name in names)
 
 
-def difference_in_words(result: LikelihoodRatio) -> str:
-    """One difference between trials with its size: `specimens (tubes of one kind) differ: ΔlnB (specimen 2) = …`."""
+def hypothesis_in_words(result: LikelihoodRatio) -> str:
+    """A hypothesis with its sizes: `leak has 1/τ = …`, `specimens (tubes of one kind) differ: ΔlnB (2) = …`."""
+    if result.effects[-1].kind != BETWEEN_TRIALS:
+        return " has ".join(filter(None, (" with ".join(result.names), sizes_in_words(result.numbers))))
     more = len(result.numbers) - MOST_NAMED
     sizes = f"{sizes_in_words(result.numbers[:MOST_NAMED])}{f' and {more} more' if more > 0 else ''}"
     return f"{BETWEEN[result.names[-1]].summary}: {sizes}"
@@ -411,7 +413,7 @@ def explain(step: SelectionStep) -> str:
     best = answers[0]
     facts: dict[str, Any] = {"name": best.names[0] if step.note else best.names[-1], "model": model, "trials": trials}
     facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
-    facts |= {"hypotheses": _hypotheses(answers)}
+    facts |= {"hypotheses": "; ".join(map(hypothesis_in_words, answers))}
     text = sentence(_EXPLAINED[verdict], facts)
     if step.note:
         note = str(step.note)
@@ -454,30 +456,12 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
 
 
 def _with_the_fault(step: SelectionStep) -> str:
-    """Give the parameters whose value with the likeliest fault in the model lies outside their 95 % interval without
-    it, n first.
-    """
+    """N and B with the likeliest fault in the model, and without it."""
     best, before = step.answer_set[0], {number.name: number for number in step.tests.fit.numbers}
-    biased = [
-        number
-        for number in sorted(best.others, key=lambda number: number.key != EXPONENT)
-        if (without := before.get(number.name)) and math.isfinite(without.sigma + number.sigma)
-        if not without.low <= number.value <= without.high
-    ]
-    if not biased or best.names[-1] == N_BY_VINE:
-        return ""
-    changes = [f"{estimate_text(number)} instead of {value_text(before[number.name])}" for number in biased]
-    more = len(changes) - MOST_NAMED
-    others = f", and {more} more parameter{'s change' if more > 1 else ' changes'}" if more > 0 else ""
-    return f" Fitted together with {best.names[-1]}, {', '.join(changes[:MOST_NAMED])}{others}."
-
-
-def _hypotheses(answers: Sequence[LikelihoodRatio]) -> str:
-    """The hypotheses of an answer set with their sizes, differences between trials first."""
-    differences = [difference_in_words(result) for result in answers if result.effects[-1].kind == BETWEEN_TRIALS]
-    effects = [result for result in answers if result.effects[-1].kind != BETWEEN_TRIALS]
-    sizes = {" with ".join(result.names): sizes_in_words(result.numbers) for result in effects}
-    return "; ".join([*differences, *(f"{names} has {size}" if size else names for names, size in sizes.items())])
+    law = [each for each in best.others if each.key in (EXPONENT, DAMPING) and each.name in before]
+    law = sorted(law, key=lambda each: each.key != EXPONENT)[:MOST_NAMED]
+    changes = ", ".join(f"{estimate_text(each)} instead of {value_text(before[each.name])}" for each in law)
+    return f" Fitted together with {best.names[-1]}, {changes}." if changes else ""
 
 
 def _adequate(step: SelectionStep, model: str, trials: str) -> str:
@@ -485,7 +469,7 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
     if not step.unstated_differences:
         return text
     unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)
-    facts = {"difference": difference_in_words(unstated), "gain": unstated.delta_chi2}
+    facts = {"difference": hypothesis_in_words(unstated), "gain": unstated.delta_chi2}
     return f"{text} {sentence('trials_seem_to_differ', facts)}{remedies_in_words(step, [unstated])}"
 
 

@@ -23,8 +23,7 @@ from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
-from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.diagnosis.result import ADEQUATE, Power, PowerInput, SimulatedRates
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment.folder import (
