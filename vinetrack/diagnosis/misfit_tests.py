@@ -118,7 +118,8 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
         return [CandidateShape(effect, (), 1.0, whole=True)]
     size, *others = effect.parameters
     combinations = list(itertools.product(*(_typical_values(parameter) for parameter in others)))
-    shapes = [CandidateShape(effect, values, _first_step(size)) for values in combinations]
+    step = 0.01 * max(abs(end - size.zero) for end in plausible_range(size))
+    shapes = [CandidateShape(effect, values, step) for values in combinations]
     if others or effect.finite:
         middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
@@ -145,12 +146,6 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
         for values in other_values
         for fraction in fractions
     ]
-
-
-def _first_step(size: Parameter) -> float:
-    """A size small compared with the plausible range."""
-    low, high = plausible_range(size)
-    return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
@@ -242,7 +237,12 @@ def _sensitivity(
         change = _change(fit, shape, baseline)
         response = _response(fit, change)
         if shape.whole:
-            usable = response > least_detectable_response and not _prevents_growth(baseline, change)
+            # 0.1: part of its travel that a vine must still make: one that hardly starts excludes the size (chosen)
+            grows = all(
+                float(np.max(before.observed_position_m + moved)) >= 0.1 * float(np.max(before.observed_position_m))
+                for before, moved in zip(baseline, change, strict=True)
+            )
+            usable = response > least_detectable_response and grows
             return (shape, [moved / shape.step for moved in change]) if usable else None
         if response <= least_detectable_response * 1e-3:
             return None
@@ -258,15 +258,6 @@ def _sensitivity(
     except SimulationError:
         return None
     return (shape, [moved / shape.step for moved in change]) if response > least_detectable_response else None
-
-
-def _prevents_growth(baseline: Sequence[Trajectory], change: Sequence[Floats]) -> bool:
-    """Whether some vine that grew in the recording hardly starts with the effect: so large a size is excluded."""
-    # 0.1: part of its travel that a vine must still make with a finite effect added (chosen)
-    return any(
-        float(np.max(before.observed_position_m + moved)) < 0.1 * float(np.max(before.observed_position_m))
-        for before, moved in zip(baseline, change, strict=True)
-    )
 
 
 def _response(fit: Fit, change: Sequence[Floats]) -> float:
