@@ -200,11 +200,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: f
 
 
 # ------------------------------------------------------------------------------
-# Sensitivities of a fit's trajectories to effects that are not in its model.
-#
-# Each column is the change of a trial's positions per unit of an effect's size, with the effect added to the fitted
-# model and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross
-# products, from which score tests, cosines and expected gains follow by linear algebra.
+# Sensitivities of a fit's trajectories to effects that are not in its model: each column is the change of a trial's
+# positions per unit of an effect's size, all other parameters held.
 
 
 def _sensitivities(
@@ -282,10 +279,8 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 
 # ------------------------------------------------------------------------------
-# Columns of a fit and of candidates, and their cross products by trial.
-#
-# In this order: trial effects, unknowns, residual, shapes of candidates. The unknowns are the parameters of the fit and
-# its systematic errors, which have a standard normal prior each.
+# Columns of a fit and of candidates, and their cross products by trial, in this order: trial effects, unknowns (the
+# parameters of the fit and its systematic errors, which have a standard normal prior each), residual, shapes.
 
 
 @dataclass(frozen=True)
@@ -454,12 +449,8 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
 
 
 # ------------------------------------------------------------------------------
-# Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
-#
-# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
-# for all scores the first would take most of the false alarms and raise the threshold of the second. Each candidate
-# therefore has the same probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are
-# effectively independent.
+# Thresholds of all candidates. One with many shapes has many chances of a large score: each candidate has the same
+# probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are independent.
 
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> defaultdict[str, float]:
@@ -511,9 +502,7 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 
 
 # ------------------------------------------------------------------------------
-# Whether trial effects have absorbed what a model lacks.
-#
-# The deviations of pressure and B of each trial can absorb part of a misfit. Deviations by chance differ between
+# Whether trial effects have absorbed what a model lacks. By chance, deviations of pressure and B differ between
 # replicates of a condition; those that compensate for the model are the same in all of them.
 
 MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)

@@ -216,11 +216,9 @@ class SmoothForce:
 
 
 # ------------------------------------------------------------------------------
-# The choice of variables.
-#
-# Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
-# be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
-# prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
+# The choice of variables. Where speeds are steady, growth, speed and time are hardly three separate variables: a
+# surface over two of them can be written over another two, and weights compare only how smooth the surfaces are, which
+# depends on the prior. A choice is therefore excluded by the misfit that it leaves, not by its weight alone.
 
 # Part of χ² that is the unit of differences of ln Z where that is more than 1: so much depends on the prior (chosen)
 LEAST_DIFFERENCE = 5e-4
