@@ -55,6 +55,8 @@ def fits(pairs):
 def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits, pairs):
     table = ladder(fits, ["", DEPLETION])
     assert table["added"].tolist() == ["", DEPLETION]
+    # Laid on the last model: far off, the first one would make replicates differ by more than they do.
+    assert table["floor_m"].tolist() == [in_sample(fits[1]).floor_m] * 2
     before, after = (table.iloc[k] for k in range(2))
     for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
         assert before[column] > 1.3 * after[column]

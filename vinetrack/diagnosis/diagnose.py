@@ -329,10 +329,8 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
 
 
 # ------------------------------------------------------------------------------
-# Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
-#
-# One such trial among thirty causes a misfit that no effect explains: it is left out and named. Outliers are detected
-# without the model that failed: over the middle of the growth damping roughly balances the force,
+# Outlying trials: a row of the sheet that belongs to another recording, or a typing error. They are detected without
+# any model: over the middle of the growth damping roughly balances the force,
 #
 #     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
 #

@@ -124,11 +124,8 @@ def added_one_by_one(allowed: NDArray[np.intp], worth: Criterion, most: int) -> 
 
 
 # ------------------------------------------------------------------------------
-# The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
-#
-# Every condition within the limits is rated by linear theory, and trials are added one by one. Their
-# separation is predicted by refitting simulated trials. Where no trials help, or only measurements are in question, the
-# advice is what to measure instead.
+# The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart, chosen by
+# linear theory, their separation predicted by refits; where none help, what to measure instead.
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
@@ -302,12 +299,9 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 
 
 # ------------------------------------------------------------------------------
-# What further trials promise, found by simulating them and refitting the hypotheses to old and new trials.
-#
-# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
-# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, old
-# and new; between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can
-# explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
+# What further trials promise. Each hypothesis in turn is taken as the truth, the new trials are simulated, and every
+# hypothesis is fitted to all trials, old and new, with scatter and noise estimated anew as in a diagnosis, so that a
+# wrong one can explain part of its misfit as scatter. The squared separation is the rise in the difference of −2 ln L.
 
 
 def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draw: int) -> Floats:

@@ -47,11 +47,9 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# The fit of the initial model, made identically for `fit.json` and for the diagnosis.
-#
-# A model that is far off has several minima close together. Started, compiled or iterated differently, two fits of it
-# would end at parameters that differ in the third digit, and every page would show both. The model is therefore
-# compiled together with all candidates of the diagnosis (`candidates_of`) in either case.
+# The fit of the initial model, for `fit.json` and for the diagnosis. A model that is far off has several minima close
+# together: fits that are started or compiled differently end at parameters that differ in the third digit. The model is
+# therefore compiled together with all candidates of the diagnosis in either case.
 
 
 def candidates_of(
@@ -300,15 +298,9 @@ def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[
 
 
 # ------------------------------------------------------------------------------
-# Errors of a fitted model by condition, compared with the scatter of replicates.
-#
-# The prediction of a trial has its own release and origin, but no deviation of pressure and B, as for a trial that
-# was left out of the fit. The origin is the position at standstill; the release, and the origin where no standstill
-# was filmed, minimise the root mean square error. So laid on the model, replicates differ from their mean by their
-# scatter: of a model that lacks nothing the error is about the replicate floor, a ratio of 1.
-#
-# The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of
-# the final speed of the leading edge.
+# Errors of a fitted model by condition: those of the paper's Table II (Alvarez et al., 2025), of position over the
+# whole growth and of the final speed of the leading edge. The release, and the origin where no standstill was filmed,
+# minimise the root mean square error: of a model that lacks nothing it is about the replicate floor, a ratio of 1.
 
 COMPARISON_COLUMNS = (
     *("model", "condition", "rms_position_m", "rms_final_velocity_m_s", "replicate_floor_m", "ratio", "worst_at_s"),

@@ -267,11 +267,8 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
 
 
 # ------------------------------------------------------------------------------
-# Memory of a search over hypotheses about many trials: it keeps fits without their curves.
-#
-# The curves of a fit to a thousand trials of 550 frames take some sixty megabytes, its misfit tests 700, and a search
-# makes dozens of fits. Numbers, likelihood and state of a fit stay; its curves are computed again from them where a
-# later step needs them.
+# Memory of a search about many trials. The curves of a fit to a thousand trials take some sixty megabytes, its misfit
+# tests 700, and a search makes dozens of fits: they are kept without curves, which are computed again where needed.
 
 
 def is_large(fit: Fit) -> bool:

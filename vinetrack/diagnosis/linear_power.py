@@ -63,13 +63,10 @@ from vinetrack.planning.candidate_trials import at_solution, extended_fit, track
 from vinetrack.tracks.position_noise import ar1_noise
 
 # ------------------------------------------------------------------------------
-# Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
-#
-# In linear theory the free parameters move in proportion to the size of an effect. An effect that they nearly imitate
-# moves them by many standard errors before it becomes detectable, and by then the sensitivities have changed. So each
-# effect is put into noise-free trajectories at the size in question, the model without it is fitted to them with noise
-# and between-trial standard deviations held, and the score is computed there: the Asimov data set of Cowan, Cranmer,
-# Gross & Vitells, European Physical Journal C 71, 1554, 2011.
+# Expected scores of effects of finite size. Free parameters that nearly imitate an effect move by many standard errors
+# before it becomes detectable, and sensitivities change. So the effect is put into noise-free trajectories, the model
+# without it is fitted to them with noise and between-trial standard deviations held, and the score is computed there:
+# the Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 
 
 def noiseless_start(fit: Fit) -> Fit:

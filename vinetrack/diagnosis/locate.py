@@ -162,14 +162,10 @@ def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
 # ------------------------------------------------------------------------------
 # Parameters that drift with a condition on which they should not depend.
 #
-# One B should describe a vine at every pressure and with every payload. The best value is therefore fitted to each
-# trial, with all other parameters at their common values, by least squares of position with its release free: it takes
-# upon itself whatever a model lacks. Values that follow the pressure point to what is missing. Their scatter by chance
-# is taken from replicates, not from the between-trial standard deviations and noise of the fit, which a model that
-# fails inflates.
-#
-# The common parameters were fitted to the same trials and have absorbed part of the drift (n most of it, where B
-# follows the pressure): what is found is the remainder, and its z is too small rather than too large.
+# One B should describe a vine at every pressure and with every payload. The best value is fitted to each trial, all
+# other parameters at their common values: it takes upon itself whatever a model lacks. Scatter by chance is taken from
+# replicates, not from the fit, which a model that fails inflates. The common parameters have absorbed part of the drift
+# (n most of it, where B follows the pressure): z is too small rather than too large.
 
 FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called significant where nothing drifts (chosen)
 FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)

@@ -118,7 +118,8 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
         return [CandidateShape(effect, (), 1.0, whole=True)]
     size, *others = effect.parameters
     combinations = list(itertools.product(*(_typical_values(parameter) for parameter in others)))
-    shapes = [CandidateShape(effect, values, _first_step(size)) for values in combinations]
+    step = 0.01 * max(abs(end - size.zero) for end in plausible_range(size))
+    shapes = [CandidateShape(effect, values, step) for values in combinations]
     if others or effect.finite:
         middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
@@ -145,12 +146,6 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
         for values in other_values
         for fraction in fractions
     ]
-
-
-def _first_step(size: Parameter) -> float:
-    """A size small compared with the plausible range."""
-    low, high = plausible_range(size)
-    return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
@@ -205,11 +200,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: f
 
 
 # ------------------------------------------------------------------------------
-# Sensitivities of a fit's trajectories to effects that are not in its model.
-#
-# Each column is the change of a trial's positions per unit of an effect's size, with the effect added to the fitted
-# model and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross
-# products, from which score tests, cosines and expected gains follow by linear algebra.
+# Sensitivities of a fit's trajectories to effects that are not in its model: each column is the change of a trial's
+# positions per unit of an effect's size, all other parameters held.
 
 
 def _sensitivities(
@@ -242,7 +234,12 @@ def _sensitivity(
         change = _change(fit, shape, baseline)
         response = _response(fit, change)
         if shape.whole:
-            usable = response > least_detectable_response and not _prevents_growth(baseline, change)
+            # 0.1: part of its travel that a vine must still make: one that hardly starts excludes the size (chosen)
+            grows = all(
+                float(np.max(before.observed_position_m + moved)) >= 0.1 * float(np.max(before.observed_position_m))
+                for before, moved in zip(baseline, change, strict=True)
+            )
+            usable = response > least_detectable_response and grows
             return (shape, [moved / shape.step for moved in change]) if usable else None
         if response <= least_detectable_response * 1e-3:
             return None
@@ -258,15 +255,6 @@ def _sensitivity(
     except SimulationError:
         return None
     return (shape, [moved / shape.step for moved in change]) if response > least_detectable_response else None
-
-
-def _prevents_growth(baseline: Sequence[Trajectory], change: Sequence[Floats]) -> bool:
-    """Whether some vine that grew in the recording hardly starts with the effect: so large a size is excluded."""
-    # 0.1: part of its travel that a vine must still make with a finite effect added (chosen)
-    return any(
-        float(np.max(before.observed_position_m + moved)) < 0.1 * float(np.max(before.observed_position_m))
-        for before, moved in zip(baseline, change, strict=True)
-    )
 
 
 def _response(fit: Fit, change: Sequence[Floats]) -> float:
@@ -291,10 +279,8 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 
 # ------------------------------------------------------------------------------
-# Columns of a fit and of candidates, and their cross products by trial.
-#
-# In this order: trial effects, unknowns, residual, shapes of candidates. The unknowns are the parameters of the fit and
-# its systematic errors, which have a standard normal prior each.
+# Columns of a fit and of candidates, and their cross products by trial, in this order: trial effects, unknowns (the
+# parameters of the fit and its systematic errors, which have a standard normal prior each), residual, shapes.
 
 
 @dataclass(frozen=True)
@@ -463,12 +449,8 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
 
 
 # ------------------------------------------------------------------------------
-# Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
-#
-# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
-# for all scores the first would take most of the false alarms and raise the threshold of the second. Each candidate
-# therefore has the same probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are
-# effectively independent.
+# Thresholds of all candidates. One with many shapes has many chances of a large score: each candidate has the same
+# probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are independent.
 
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> defaultdict[str, float]:
@@ -520,9 +502,7 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 
 
 # ------------------------------------------------------------------------------
-# Whether trial effects have absorbed what a model lacks.
-#
-# The deviations of pressure and B of each trial can absorb part of a misfit. Deviations by chance differ between
+# Whether trial effects have absorbed what a model lacks. By chance, deviations of pressure and B differ between
 # replicates of a condition; those that compensate for the model are the same in all of them.
 
 MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)

@@ -149,23 +149,13 @@ class Domain:
         return np.hstack(modes)
 
 
-def _visited(motions: Sequence[FittedMotion], name: str) -> list[Floats]:
-    """A variable along the visited part of each motion."""
-    return [np.asarray(getattr(motion, VARIABLES[name]))[motion.is_visited] for motion in motions]
-
-
-def _highest(motions: Sequence[FittedMotion], name: str) -> float:
-    """The highest value of a variable among the motions."""
-    # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
-    share = 0.98 if name == "speed" else 1.0
-    return max(float(np.quantile(values, share)) for values in _visited(motions, name))
-
-
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     """Every variable alone, then every pair, over the ranges that the motions visit."""
     ranges: dict[str, tuple[float, float, float]] = {}
     for name in VARIABLES:
-        by_trial, high = _visited(motions, name), _highest(motions, name)
+        by_trial = [np.asarray(getattr(motion, VARIABLES[name]))[motion.is_visited] for motion in motions]
+        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
+        high = max(float(np.quantile(values, 0.98 if name == "speed" else 1.0)) for values in by_trial)
         low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
         # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
         if high - low > 0.02 * abs(high):
@@ -226,11 +216,9 @@ class SmoothForce:
 
 
 # ------------------------------------------------------------------------------
-# The choice of variables.
-#
-# Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
-# be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
-# prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
+# The choice of variables. Where speeds are steady, growth, speed and time are hardly three separate variables: a
+# surface over two of them can be written over another two, and weights compare only how smooth the surfaces are, which
+# depends on the prior. A choice is therefore excluded by the misfit that it leaves, not by its weight alone.
 
 # Part of χ² that is the unit of differences of ln Z where that is more than 1: so much depends on the prior (chosen)
 LEAST_DIFFERENCE = 5e-4

@@ -93,16 +93,12 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 
 
 # ------------------------------------------------------------------------------
-# A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
-#
-# Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
-# coefficients of its splines, N, at even steps of each normalised variable (`missing_force.Domain`), and a function
-# that sums them:
+# A learned force as an effect file: where no formula reproduces it, the coefficients of its splines, N, at even steps
+# of each normalised variable (`missing_force.Domain`), and a function that sums them:
 #
 #     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
 #
-# β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter scales the table; 1 is the force as
-# learned.
+# β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter scales the table.
 
 
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}

@@ -451,10 +451,11 @@ def speed_band_text(share: Band) -> str:
     return f"{number(share.low)} to {number(share.high)} m/s"
 
 
-def _sizes(changes: Sequence[tuple[str, float, str]], by: str) -> list[str]:
-    """Names of numbers with the sizes of their changes, in display units."""
+def _changes(changes: Sequence[tuple[str, float, str]]) -> str:
+    """The first four numbers with the sizes of their changes, in display units."""
     sized = [(name, f"{size * times:.2g} {u}") for name, size, unit in changes for u, times in [display_unit(unit)]]
-    return [f"{name} {by} {size}".rstrip() for name, size in sized]
+    told = [f"{name} by {size}".rstrip() for name, size in sized]
+    return ", ".join(told[:4]) + (f", and {len(told) - 4} more" if len(told) > 4 else "")
 
 
 # Facts in words, by the names that `sentences.csv` gives them in place of a format
@@ -467,10 +468,7 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "code": lambda names: f"`{'` and `'.join(names)}`",
     "number": number,
     "word": lambda count: ("two", "three", "four", "five")[count - 2],
-    "scatter": lambda changes: ", ".join(_sizes(changes, "by ±")),
-    "changes": lambda changes: (
-        ", ".join(_sizes(changes[:4], "by")) + (f", and {len(changes) - 4} more" if len(changes) > 4 else "")
-    ),
+    "changes": _changes,
     "remedy": lambda source: SHARED_REMEDIES[source],
     "condition": lambda condition: _condition_text(**condition),
     "variables": _variables_text,
