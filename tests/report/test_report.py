@@ -196,9 +196,9 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
 
 def test_upper_limits_are_in_the_displayed_unit():
     found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
-    assert build.upper_limits(found, {}) == [("leak", "k", "2.50 kPa")]
+    assert build.upper_limits(found, {}) == {("leak", "k"): "2.50 kPa"}
     unfitted = candidate("pressure_drive", 1.0, numbers=[], largest={"pressure_drive.k": 1.0})
-    assert build.upper_limits([Candidate.from_json(unfitted)], catalogue()) == [("pressure drive", "k", "1.00 SI")]
+    assert build.upper_limits([Candidate.from_json(unfitted)], catalogue()) == {("pressure drive", "k"): "1.00 SI"}
     (kappa,) = catalogue()["moving_average"].parameters
     unfitted = candidate("moving_average", 1.0, numbers=[], largest={f"moving_average.{kappa.name}": 2.0})
     (limit,) = build.upper_limits([Candidate.from_json(unfitted)], catalogue())

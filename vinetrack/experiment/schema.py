@@ -199,22 +199,16 @@ _WITH_UNIT = re.compile(r"([-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?)\s*([^\W\d_].*
 
 
 def value_and_unit(cell: str, name: str) -> tuple[str, str]:
-    """Split `150 um` into a number and the key of its unit, which must be one of the quantity of a column; blank where
-    the cell has none.
-    """
+    """Split `150 um` into its number and the key of its unit, one of a column's quantity; blank where it has none."""
     own = split_unit(name)[1]
     if not (own and (found := _WITH_UNIT.fullmatch(cell))):
         return cell, ""
-    written = {
-        text.lower(): key for key, unit in UNITS.items() if unit.si == UNITS[own].si for text in (unit.text, key)
-    }
     word = found[2].replace("μ", "µ").lower()
-    if word not in written:
-        remedy = (
-            f"write the number alone, in {UNITS[own].text}, or with one of {', '.join(dict.fromkeys(written.values()))}"
-        )
-        raise InputError(f"has a unit, {found[2]}, that is none of this column", remedy, code="not_a_unit")
-    return found[1], written[word]
+    for key, unit in UNITS.items():
+        if unit.si == UNITS[own].si and word in (key.lower(), unit.text.lower()):
+            return found[1], key
+    message = f"has a unit, {found[2]}, that is none of this column"
+    raise InputError(message, f"write the number alone, in {UNITS[own].text}", code="not_a_unit")
 
 
 # ------------------------------------------------------------------------------

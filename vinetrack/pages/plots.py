@@ -386,10 +386,8 @@ class FilmPanel:
         self._film: Film | None = None
         self._job: Job[tuple[int, float], Film] | None = None
         self._view: RecordingView | None = None
-        self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
         self.trial_select = bk.Select(options=names, value=names[0], width=220, title="trial", name="film_trial")
-        self.play = button("▶ play", "film_play", self._toggle_play, width=84)
         numbers = {"start": 0, "end": 1, "value": 0, "step": 1, "sizing_mode": "stretch_width"}
         self.frame = bk.Slider(**numbers, title="frame", name="film_frame", css_classes=["frame"])
         self.caption = bk.Div(name="film_caption")
@@ -399,7 +397,7 @@ class FilmPanel:
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, _new: self._show_frame())
         css = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
-        controls = bk.Row(self.trial_select, self.play, self.frame, stylesheets=[css], sizing_mode="stretch_width")
+        controls = bk.Row(self.trial_select, self.frame, stylesheets=[css], sizing_mode="stretch_width")
         self.root = bk.Column(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
@@ -432,12 +430,11 @@ class FilmPanel:
 
     def show_trial(self, name: str) -> None:
         """Show another trial: decode its recording, or show why there is none."""
-        self._stop()
         self.close()
         if self.trial_select.value != name:
             self.trial_select.value = name
             return
-        self.figure.visible = self.play.visible = self.frame.visible = False
+        self.figure.visible = self.frame.visible = False
         view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
         if isinstance(view, str):
             self.caption.text = f"<p>{escape(view)}</p>"
@@ -462,7 +459,7 @@ class FilmPanel:
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
         self._image.glyph.update(dw=width, dh=height)
         self.figure.aspect_ratio = width / height
-        self.figure.visible = self.play.visible = self.frame.visible = True
+        self.figure.visible = self.frame.visible = True
         known = np.flatnonzero(view.track["edge_px"].notna())
         last = len(film.frames) - 1
         # The first frame that is shown: half-way along the motion
@@ -520,25 +517,6 @@ class FilmPanel:
                 for key, value in zip(lines, (*ends, colour, dash), strict=True):
                     lines[key].append(value)
         self._edges.data = lines
-
-    def _toggle_play(self) -> None:
-        if self._playing is not None:
-            self._stop()
-            return
-        self.play.label = "❚❚ pause"
-
-        def advance() -> None:
-            following = int(self.frame.value) + max(int(self.frame.end) // 150, 1)
-            self.frame.value = following if following <= self.frame.end else 0
-
-        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
-        self._playing = self._document.add_periodic_callback(advance, 70)
-
-    def _stop(self) -> None:
-        if self._playing is not None:
-            self._document.remove_periodic_callback(self._playing)
-            self._playing = None
-        self.play.label = "▶ play"
 
     def close(self) -> None:
         """Stop decoding, and let the recording go."""

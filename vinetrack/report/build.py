@@ -182,11 +182,10 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     # Upper limits are valid only if no effect is missing.
     limits = upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects)
-    columns, of_power = ["Effect", "number", *POWER_COLUMNS[2:]], {row[:2] for row in sizes}
-    if sizes and limits:
-        at_most = {row[:2]: row[2] for row in limits}
-        columns.insert(2, "at most")
-        sizes = [(*row[:2], at_most.get(row[:2], "–"), *row[2:]) for row in sizes]
+    hidden = [(*name, limit) for name, limit in limits.items() if name not in {row[:2] for row in sizes}]
+    columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
+    if limits:
+        sizes = [(*row[:2], limits.get(row[:2], "–"), *row[2:]) for row in sizes]
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
@@ -198,7 +197,7 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": rounds,
-        "hidden": [row for row in limits if row[:2] not in of_power],
+        "hidden": hidden,
         "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes, "columns": columns},
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
@@ -210,15 +209,12 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
 def ladder_rows(ladder: pd.DataFrame | None) -> list[tuple[str, ...]]:
     """Return the errors of every model of `ladder.csv`, mm."""
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
-    return [
-        (_step(str(row["added"] or ""), row.get("partial")), *(number(1e3 * float(row[key])) for key in keys))
-        for row in ([] if ladder is None else ladder.to_dict("records"))
-    ]
-
-
-def _step(added: str, partial: object = False) -> str:
-    mark = " (partial)" if partial else ""
-    return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
+    shown = []
+    for row in [] if ladder is None else ladder.to_dict("records"):
+        mark = " (partial)" if row.get("partial") else ""
+        step = f"+ {listed_names(row['added'].split('+'))}{mark}" if row["added"] else "initial model"
+        shown.append((step, *(number(1e3 * float(row[key])) for key in keys)))
+    return shown
 
 
 def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
@@ -238,9 +234,9 @@ def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
     ]
 
 
-def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> list[tuple[str, str, str]]:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; `effects` are known by name."""
-    rows = []
+def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> dict[tuple[str, ...], str]:
+    """Return one-sided 95 % upper limits by candidate of a ranking and symbol; `effects` are known by name."""
+    limits: dict[tuple[str, ...], str] = {}
     for row in ranking:
         named = effects[row.effect].parameters if row.effect in effects else ()
         of = {parameter.name: (parameter.symbol, parameter.unit) for parameter in named}
@@ -250,8 +246,8 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
                 short = name.split(".")[-1]
                 symbol, unit = of.get(short) or (short, "SI")
                 shown, factor = display_unit(unit)
-                rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
-    return rows
+                limits[spaced_name(row.effect), symbol] = f"{number(factor * largest)} {shown}".strip()
+    return limits
 
 
 TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
