@@ -92,11 +92,18 @@ def test_a_trial_put_aside_is_listed_and_not_judged(folder):
     assert {problem.severity for problem in experiment.problems} == {"warning"}
 
 
+def test_a_cell_may_state_a_unit_of_its_own(folder):
+    given = {"diameter_mm": "2.4 cm", "thickness_um": "0.2mm", "pressure_kPa": "4 psi", "length_mm": "280 MM"}
+    (trial,) = one(folder, **given).trials
+    sizes = (trial.diameter_m, trial.thickness_m, trial.pressure_Pa, trial.length_m)
+    assert sizes == pytest.approx((0.024, 200e-6, 27579.03, 0.28), rel=1e-6)
+
+
 FAULTS = {
-    "diameter_mm": ("", "0.024", "abc", "nan", "-3", "301", "1e400", "24 mm"),
+    "diameter_mm": ("", "0.024", "abc", "nan", "-3", "301", "1e400", "24 kPa"),
     "thickness_um": ("", "0", "80000", "1_0"),
     "length_mm": ("", "1e9", "٣"),
-    "pressure_kPa": ("24000", "-1", "28 kPa", "0x1F"),
+    "pressure_kPa": ("24000", "-1", "28 furlong", "0x1F"),
     "yield_pressure_kPa": ("", "3000", "-0.1"),
     "payload_g": ("-1", "none", "1e9", "2\nerror: all is lost"),
     "growth_angle_deg": ("181", "down", "1 2"),
@@ -365,7 +372,7 @@ def test_what_is_no_mapping_is_refused(tmp_path):
 
 
 NOT_ALLOWED = {
-    "pressure_kPa": ("24000", ".nan", "12 kPa", "true", "[1, 2]"),
+    "pressure_kPa": ("24000", ".nan", "12 furlong", "true", "[1, 2]"),
     "diameter_mm": ("0.024",),
     "travel_ratio": ("3",),
     "steady": ("0.2:0.1",),

@@ -2,10 +2,12 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
 from chrome import Chrome, find_chrome
 from explorer_campaign import film_of, make_experiment, make_results
+from ruler_picture import ruler_picture
 from served import Served, Visitor, served_here
 
 from vinetrack.core.tables import read_table, read_yaml
@@ -178,6 +180,34 @@ def test_a_folder_of_clips_becomes_an_experiment(person, clips):
     assert (settings.capture_fps, scale.kind, scale.length_mm) == (1000, "two_points", 168.75)
     assert scale.from_px == pytest.approx((15, 150), abs=0.6)
     assert read_table(clips / "trials.csv").columns == ("trial", "video", "diameter_mm", "pressure_kPa")
+
+
+@pytest.fixture
+def photographed(clips):
+    cv2.imwrite(str(clips / "IMG_1.png"), ruler_picture(3, 3.0, -5, 140, size=(480, 160)))
+
+
+@pytest.mark.usefixtures("photographed")
+def test_the_marks_of_a_ruler_are_proposed_and_how_the_camera_was_turned_is_asked(person, clips):
+    """Growth runs level in these pictures; the photo is offered with the scale, and one spacing is typed."""
+    person.chrome.wait("document.querySelector('#turned')?.hidden === false", "the question", 120)
+    person.press("#turned [value='0']")
+    assert person.chrome.run("document.querySelector('#turned').hidden")
+    for column, value in SHARED.items():
+        person.fill(column, "shared", value)
+    person.press("input[name=tool][value=scale]")
+    person.said("#marks-step", "marks found")
+    person.chrome.run("document.querySelector('#spacing').focus()")
+    person.chrome.send("Input.insertText", text="1")
+    person.said("#headline", "complete")
+    # What is saved meanwhile leaves the result of the check.
+    person.press("#check")
+    person.save()
+    person.said("#headline", "ready to run")
+    settings = read_experiment_settings(clips / "experiment.yaml")
+    apart_px = np.hypot(*np.subtract(settings.calibration.to_px, settings.calibration.from_px))
+    assert settings.calibration.length_mm / apart_px == pytest.approx(1 / 3.0, rel=1e-3)
+    assert settings.growth_angle_deg == 0
 
 
 def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person, clips):

@@ -6,7 +6,6 @@ import math
 import re
 import shutil
 import socket
-import threading
 import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +33,6 @@ from vinetrack.effects import Parameter, remember
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.laboratory.tracks import grow, read_ground_truth
-from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, predict_choice, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
@@ -272,46 +270,19 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_find
         page.page.close()
 
 
-@pytest.fixture
-def opened(campaign, tmp_path):
-    """A page of a copy of experiment and results, diagnosed as `unexplained`."""
-    experiment, folder = tmp_path / "vines", tmp_path / "results"
-    shutil.copytree(campaign.experiment.folder, experiment)
-    shutil.copytree(campaign.folder, folder)
-    path = write_diagnosis(folder)
+def test_after_unexplained_the_command_is_named_and_an_effect_of_ones_own_is_saved(campaign, tmp_path):
+    folder, results = tmp_path / "vines", tmp_path / "results"
+    shutil.copytree(campaign.experiment.folder, folder)
+    shutil.copytree(campaign.folder, results)
+    path = write_diagnosis(results)
     rounds = [{"model": [], "verdict": "unexplained", "ranking": []}]
     known = {**json.loads(path.read_text()), "verdict": "unexplained", "answer_set": [], "rounds": rounds}
     path.write_text(json.dumps(known), encoding="utf-8")
-    browser = Browser(fitted(open_campaign(folder, experiment)))
-    yield browser
-    browser.page.close()
-
-
-def test_an_effect_is_proposed_and_an_own_one_saved(opened, tmp_path, monkeypatch):
-    folder, going_on = tmp_path / "vines", threading.Event()
-
-    def search(experiment, results: Path, to: Path | None, told: Callable[[str], None]) -> tuple[list, list]:
-        assert (experiment.folder, results, to) == (folder, tmp_path / "results", None)
-        told("learning the missing force as a table")
-        assert going_on.wait(60)
-        path = write_effect(folder)
-        remember(path)
-        return ["A law of the travel does.", f"Written to {path}."], [path]
-
-    monkeypatch.setattr(controls, "propose_effect", search)
-    assert opened.model("propose_panel").visible
-    assert f"vinetrack propose {(tmp_path / 'results').as_posix()}" in opened.text("proposal")
-    opened.click("propose")
-    opened.until(lambda: (opened.page._update_status(), "learning the missing force" in opened.text("proposal"))[1])
-    assert opened.model("propose").label == "Stop"
-    going_on.set()
-    opened.until(lambda: "Written to" in opened.text("proposal"))
-    assert not opened.model("propose").visible
-
+    remember(write_effect(folder))
     with (folder / "experiment.yaml").open("a", encoding="utf-8") as settings:
         settings.write("effects: [spring_line.py]\n")
-    campaign = open_campaign(tmp_path / "results", folder)
-    page = Browser(BackgroundFit(campaign))
+    page = Browser(fitted(open_campaign(results, folder)))
+    assert "vinetrack propose" in page.text("tied")
     page.page.choice = page.page.choice.with_effect("spring_line")
     page.click("save")
     assert "Saved." in page.text("saved")
@@ -319,32 +290,6 @@ def test_an_effect_is_proposed_and_an_own_one_saved(opened, tmp_path, monkeypatc
     settings = read_experiment_settings(folder / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
-
-
-def test_a_stopped_or_failed_search_can_be_restarted(opened, monkeypatch):
-    browser = opened
-    begun, ended = threading.Event(), threading.Event()
-
-    def endless(*given) -> None:
-        begun.set()
-        try:
-            while True:
-                given[-1]("still searching")
-        finally:
-            ended.set()
-
-    monkeypatch.setattr(controls, "propose_effect", endless)
-    browser.click("propose")
-    assert begun.wait(60)
-    browser.click("propose")
-    assert ended.wait(60)
-
-    failures: list[Callable] = [Mock(side_effect=ResultsError("no law"))]
-    for search in (*failures, lambda *_: (["no law"], [])):
-        monkeypatch.setattr(controls, "propose_effect", search)
-        browser.click("propose")
-        browser.until(lambda: "no law" in browser.text("proposal"))
-        assert browser.model("propose").label == controls.PROPOSE
 
 
 @pytest.mark.slow

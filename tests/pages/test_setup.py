@@ -7,15 +7,17 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from ruler_picture import ruler_picture
 from served import served_here
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import parse_yaml, read_table
 from vinetrack.pages import draft_files as draft
 from vinetrack.pages.local_page import PageServer
-from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, write_templates
+from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, ruler_in, write_templates
 from vinetrack.video.curved_axis import axis_through
 
 
@@ -147,6 +149,19 @@ def test_sentences_above_the_table_of_notes_are_left_out_and_short_headings_know
         assert notes(text) == 2
 
 
+def test_cells_of_notes_may_have_units_and_headings_further_words():
+    table = "clip|set pressure|tube dia|film\nlate|5.3 psi|1.6 cm|110 um\nd15_24kPa_1|24 kPa|16 mm|0.11 mm\n"
+    columns = [*COLUMNS, "thickness_um"]
+    expected = {(2, "pressure_kPa", "36.5422"), (2, "diameter_mm", "16"), (2, "thickness_um", "110"),
+                (0, "pressure_kPa", "24"), (0, "diameter_mm", "16"), (0, "thickness_um", "110")}  # fmt: skip
+    for mark in ("\t", ", "):
+        placed, told = draft.place_block("Yield 0.5 psi.\n" + table.replace("|", mark), columns, ROWS, 0, "trial")
+        assert (set(placed), len(told)) == (expected, 2)
+    assert changed("late 5.3 psi", 0, "pressure_kPa") == {(2, "pressure_kPa"): "36.5422"}
+    assert changed("clip\tpressure\nlate\t5 furlong") == {}
+    assert notes("clip\tpressure\nlate\t5 furlong") == 1
+
+
 def test_what_matches_nothing_is_named_and_changes_nothing():
     text = "clip\tpressure_kPa\tcolour\nd15_24kPa_1\t24\tred\nd99_1\t99\tblue"
     assert changed(text) == {(0, "pressure_kPa"): "24"}
@@ -165,6 +180,33 @@ def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
     assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
     assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
     assert draft.read_block("late,36") == [["late", "36"]]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"px_mm": 3.3, "turned_deg": 4, "length_mm": 150},
+        {"px_mm": 5.2, "turned_deg": -63, "length_mm": 80, "ink": 220, "wood": 50},
+        {"px_mm": 2.9, "turned_deg": 171.3, "length_mm": 190, "blur_px": 0.8},
+        {"px_mm": 4.1, "turned_deg": 90, "length_mm": 100, "marks_mm": 1.5875},
+        {"px_mm": 3.7, "turned_deg": 17.2, "length_mm": 140, "askew": 1e-4},
+    ],
+)
+def test_marks_of_a_ruler_are_found_to_a_thousandth(given):
+    found = ruler_in(ruler_picture(7, **given))
+    spacing_px = np.hypot(*np.subtract(found["to_px"], found["from_px"])) / found["spacings"]
+    marks_mm, askew = given.get("marks_mm", 1.0), given.get("askew", 0.0)
+    assert spacing_px == pytest.approx(given["px_mm"] * marks_mm, rel=1e-3)
+    assert found["spacings"] > 0.9 * given["length_mm"] / marks_mm - 6
+    # A spacing is stretched by (1 + askew m)^-2 at either end.
+    assert abs(found["uneven"]) == pytest.approx(2 * askew * given["length_mm"], abs=6e-3)
+
+
+def test_texture_is_no_ruler():
+    rng = np.random.default_rng(11)
+    for grain_px in (0.5, 1.5, 4.0):
+        texture = cv2.GaussianBlur(rng.normal(size=(300, 500)).astype(np.float32), (0, 0), grain_px)
+        assert ruler_in(np.clip(128 + 40 * texture / texture.std(), 0, 255).astype(np.uint8)) is None
 
 
 def sent(folder: Path, **more) -> dict:

@@ -132,8 +132,7 @@ def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> Remark:
             # Where each vine has its own size, one that differs from zero is enough.
             sigmas = [abs(number.value - parameter.zero) / number.sigma for number in numbers if number.sigma > 0]
             if sigmas and max(sigmas) < MIN_SIZE_SIGMAS:
-                number = numbers[0]
-                return remark("size_may_be_zero", symbol=number.symbol, value=number.value, sigma=number.sigma)
+                return remark("size_may_be_zero")
     return Remark()
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import csv
 import difflib
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -109,7 +110,9 @@ class Column:
                     return _read_bends(text, decimal)
                 case "axis":
                     return _read_axis(text)
-            return self._checked(parse_number(text, decimal))
+            number, unit = value_and_unit(text, self.name)
+            value = parse_number(number, decimal)
+            return self._checked(convert(value, unit, self.unit_key) if unit else value)
         except InputError as error:
             error.allowed = self.allowed
             raise
@@ -190,6 +193,22 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
         return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
     return f"did you mean {nearest[0]}?"
+
+
+_WITH_UNIT = re.compile(r"([-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?)\s*([^\W\d_].*)")
+
+
+def value_and_unit(cell: str, name: str) -> tuple[str, str]:
+    """Split `150 um` into its number and the key of its unit, one of a column's quantity; blank where it has none."""
+    own = split_unit(name)[1]
+    if not (own and (found := _WITH_UNIT.fullmatch(cell))):
+        return cell, ""
+    word = found[2].replace("μ", "µ").lower()
+    for key, unit in UNITS.items():
+        if unit.si == UNITS[own].si and word in (key.lower(), unit.text.lower()):
+            return found[1], key
+    message = f"has a unit, {found[2]}, that is none of this column"
+    raise InputError(message, f"write the number alone, in {UNITS[own].text}", code="not_a_unit")
 
 
 # ------------------------------------------------------------------------------

@@ -288,6 +288,7 @@ def _longest_steady(
             nearest = (
                 f"no window is shown to be steady within ±{100 * drift_limit:g} %: across the nearest, {length} of {n}"
                 f" moving points, speed changes by {100 * drift[near]:.2g} ± {196 * sigma[near]:.2g} %"
+                f"{'' if least > drift_limit else ' from end to end, and more between'}"
             )
     return None, nearest
 

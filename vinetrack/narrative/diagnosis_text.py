@@ -485,6 +485,14 @@ FORMS: dict[str, Callable[[Any], str]] = {
     ),
 }
 
+
+def _implausible_text(symbol: str, value: float, unit: str, low: float, high: float) -> str:
+    """Say which size an effect would need, in the unit in which its estimate is shown, and which are plausible."""
+    shown, factor = display_unit(unit or "1")
+    would = f"{symbol} = {factor * value:.3g} {shown}".rstrip()
+    return f"it would need {would}, and {factor * low:.3g} to {factor * high:.3g} is plausible"
+
+
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
     "sweeps": lambda trial, swept_m3, in_full: (
@@ -494,6 +502,7 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
     ),
+    "implausible_size": _implausible_text,
     "odd_trials": odd_in_words,
     "deciding_measurements": measurement_text,
     "trials_to_make": advice_text,

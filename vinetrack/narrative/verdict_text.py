@@ -75,7 +75,7 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
 # What would make the part of an error smaller that all trials share, by its source
 SHARED_REMEDIES = {
     "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
-    "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
+    "tracking": "film the edge larger or sharper", "lens": "calibrate the lens with a board",
 }  # fmt: skip
 
 
@@ -224,6 +224,9 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
     with_them = [f"with {listed_names(diagnosis.effects)} in the model"] if law and diagnosis.effects else []
+    with_them += (
+        ["of a model that these trials refute"] if law and diagnosis.final_verdict not in (ADEQUATE, "") else []
+    )
     notes = [*(f"n 95 %: {bounds_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
@@ -282,10 +285,10 @@ def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.odd_trials:
         return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
     if UNEXPLAINED in (verdict, last):
-        return (
-            "look at the figures of the missing force, and run `vinetrack propose`",
-            "it looks for a law that describes the missing force, and writes the law as an effect file of your own",
-        )
+        table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
+        if table is not None and "partial" in table and (near := list(table["added"][table["partial"].astype(bool)])):
+            return f"see what `vinetrack add {near[0]} RESULTS`, a part, leaves; then run `vinetrack propose`", told
+        return "look at the figures of the missing force, and run `vinetrack propose`", told
     if diagnosis.next_experiment:
         return str(diagnosis.next_experiment.get("text", "")), ""
     if last == ARTEFACT:

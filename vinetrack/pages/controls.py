@@ -1,44 +1,25 @@
-"""The controls of one page: the trials shown, the effects in the model with their sizes, and the proposal of one."""
+"""The controls of one page: the trials shown, and the effects in the model with their sizes."""
 
 from __future__ import annotations
 
-import shlex
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from bokeh.models import (
-    Checkbox,
-    CheckboxButtonGroup,
-    Column,
-    CustomJS,
-    Div,
-    PrintfTickFormatter,
-    Slider,
-    Toggle,
-)
+from bokeh import models as bk
 
 from vinetrack.core.units import SLIDER_UNITS, display_unit
-from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.inference.fit_result import Number, number_row
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.campaign import (
     Campaign,
-    Job,
     ModelChoice,
     SizeControl,
     sizes_of,
     slider_range,
 )
-from vinetrack.pages.plots import beside, button, panel, progress_bar, set_text
-from vinetrack.pipeline.model_stage import propose_effect
-
-if TYPE_CHECKING:
-    from vinetrack.pages.page import Page
+from vinetrack.pages.plots import beside, button
 
 
 class SizeSlider:
@@ -49,18 +30,18 @@ class SizeSlider:
         unit, self._factor = display_unit(size.parameter.unit, SLIDER_UNITS)
         what = size.vine or size.parameter.meaning
         self._opened = slider_range(size.key, size.parameter, value)
-        self.slider = Slider(
+        self.slider = bk.Slider(
             **self._ends(value),
             value=self._factor * value,
             title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
-            format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
+            format=bk.PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
             sizing_mode="stretch_width",
             disabled=disabled,
             name=f"size_{size.name}",
             css_classes=["size"],
             margin=(2, 0, 6, 0),
         )
-        self.fitted = Div(visible=False, name=f"found_{size.name}")
+        self.fitted = bk.Div(visible=False, name=f"found_{size.name}")
         self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / self._factor))
 
     def _ends(self, value: float) -> dict[str, float]:
@@ -95,12 +76,12 @@ class EffectPanel:
         ticked: Callable[[str, bool], None],
         moved: Callable[[str, str, float], None],
     ) -> None:
-        self.ticks: dict[str, Checkbox] = {}
+        self.ticks: dict[str, bk.Checkbox] = {}
         self.sliders: dict[str, list[SizeSlider]] = {}
-        rows: dict[str, Column] = {}
+        rows: dict[str, bk.Column] = {}
         for name, effect in campaign.effects.items():
             unusable = campaign.unusable.get(name, "")
-            self.ticks[name] = Checkbox(
+            self.ticks[name] = bk.Checkbox(
                 label=spaced_name(name),
                 active=name in choice.effects,
                 disabled=bool(unusable) or name in BASE_EFFECTS,  # all others are added to these
@@ -113,9 +94,9 @@ class EffectPanel:
                 SizeSlider(size, choice.numbers[size.name], bool(unusable), partial(moved, name))
                 for size in sizes_of(campaign, effect)
             ]
-            about = Div(text=f"<small>{escape(unusable or effect.formula)}</small>")
+            about = bk.Div(text=f"<small>{escape(unusable or effect.formula)}</small>")
             parts = [part for one in self.sliders[name] for part in (one.slider, one.fitted)]
-            rows[name] = Column(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
+            rows[name] = bk.Column(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
         in_use = [name for name in rows if name in choice.effects]
         likely = [name for name in suspects if name in rows and name not in in_use][:6]
         others = [name for name in rows if name not in in_use and name not in likely]
@@ -129,11 +110,11 @@ class EffectPanel:
         shown = []
         for title, names, visible in groups:
             if names:
-                inside = Column(*(rows[name] for name in names), visible=visible)
-                head = Toggle(label=title, active=visible, css_classes=["heading"], sizing_mode="stretch_width")
-                head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
-                shown.append(Column(head, inside))
-        self.root = Column(*shown, name="effects")
+                inside = bk.Column(*(rows[name] for name in names), visible=visible)
+                head = bk.Toggle(label=title, active=visible, css_classes=["heading"], sizing_mode="stretch_width")
+                head.js_on_change("active", bk.CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
+                shown.append(bk.Column(head, inside))
+        self.root = bk.Column(*shown, name="effects")
 
     def show(self, choice: ModelChoice, numbers: Mapping[str, Number]) -> None:
         """Set tick boxes and sliders to a choice, with the fitted numbers of its effects by name."""
@@ -150,14 +131,14 @@ class TrialSelector:
         self.campaign = campaign
         labels = [campaign.labels[name] for name in campaign.conditions]
         given = {"name": "conditions", "css_classes": ["chips"], "margin": (2, 0)}
-        self._conditions = CheckboxButtonGroup(labels=labels, active=self._every, **given)
+        self._conditions = bk.CheckboxButtonGroup(labels=labels, active=self._every, **given)
         self._conditions.on_change("active", lambda _attr, _old, _new: on_change())
         tools = beside(
             button("all", "choose_all", lambda: self._conditions.update(active=self._every), css_classes=["small"]),
             button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
             css=":host { gap: 4px; }",
         )
-        self.root = Column(self._conditions, tools, name="choose")
+        self.root = bk.Column(self._conditions, tools, name="choose")
 
     @property
     def _every(self) -> list[int]:
@@ -178,58 +159,3 @@ class TrialSelector:
         """Indices of the trials of the selected conditions."""
         conditions = set(self.conditions)
         return [i for i, aligned in enumerate(self.campaign.trials) if aligned.condition in conditions]
-
-
-# ------------------------------------------------------------------------------
-# If no known effect explains the misfit: a button that proposes an effect.
-
-PROPOSE = "Propose an effect"
-
-
-class ProposalPanel:
-    """Button, progress and outcome; visible if the verdict is `unexplained`."""
-
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        self._job: Job[str, tuple[list[str], list[Path]]] | None = None
-        self._task, self._begun_s = "", 0.0
-        self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
-        command = shlex.join(["vinetrack", "propose", page.campaign.folder.as_posix()])
-        self.text = Div(text=panel("propose", line=command), name="proposal")
-        diagnosis, unexplained = page.diagnosis, False
-        if diagnosis is not None and not diagnosis.contradicted_columns:
-            unexplained = UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
-        self.root = Column(self.text, self.button, name="propose_panel", visible=unexplained)
-
-    def show(self) -> None:
-        """Update the progress as time passes."""
-        if self._job is not None:
-            passed_s = time.monotonic() - self._begun_s
-            # 75 s: time in which the progress bar of a search is half full (chosen)
-            set_text(self.text, progress_bar(passed_s / (passed_s + 75.0), f"{self._task} · {passed_s:.0f} s"))
-
-    def close(self) -> None:
-        """The page was closed."""
-        if self._job is not None:
-            self._job.cancel()
-
-    def _propose_or_stop(self) -> None:
-        if self._job is not None:
-            self._job.cancel()
-            self._done(None, "The search was stopped; nothing was written.")
-            return
-        self._task, self._begun_s, self.button.label = "reading the results", time.monotonic(), "Stop"
-        campaign, soon = self._page.campaign, self._page.document.add_next_tick_callback
-        search = partial(propose_effect, campaign.experiment, campaign.folder, None)
-        self._job = Job(search, self._on_progress, self._done, soon)
-        self.show()
-
-    def _on_progress(self, task: str) -> None:
-        """Called from the job's thread; the status line shows it."""
-        self._task = task
-
-    def _done(self, outcome: tuple[list[str], list[Path]] | None, reason: str) -> None:
-        self._job, self.button.label = None, PROPOSE
-        lines, files = outcome or ([reason], [])
-        self.button.visible = not files
-        set_text(self.text, "".join(f"<p>{escape(line)}</p>" for line in lines))

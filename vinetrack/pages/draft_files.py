@@ -27,9 +27,9 @@ from vinetrack.core.tables import (
     write_bytes,
     write_text,
 )
-from vinetrack.core.units import convert, other_units, split_unit
+from vinetrack.core.units import UNITS, convert, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
-from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and_unit
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.importers import read_track
@@ -53,12 +53,15 @@ _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
 
 def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
-    """A cell of the column `name` in the unit of another of the same quantity; numbers get the decimal mark."""
-    if not _NUMBER.fullmatch(cell):
+    """A cell of the column `name`, with or without a unit of its own, in the unit of another of the same quantity;
+    numbers get the decimal mark.
+    """
+    number, unit = value_and_unit(cell, name)
+    if not _NUMBER.fullmatch(number):
         return cell
-    number = cell.replace(",", ".")
-    if name != column:
-        number = f"{convert(float(number), split_unit(name)[1], split_unit(column)[1]):.6g}"
+    unit, wanted, number = unit or split_unit(name)[1], split_unit(column)[1], number.replace(",", ".")
+    if unit != wanted:
+        number = f"{convert(float(number), unit, wanted):.6g}"
     return number.replace(".", decimal)
 
 
@@ -145,10 +148,9 @@ def first_settings() -> str:
     width, lines = max(map(len, keys)) + 3, []
     for key in keys:
         column = COLUMNS[key]
-        unit = f" [{column.unit}]" if column.unit and column.unit.lower() not in column.meaning.lower() else ""
         how = f" {column.measured}" if column.measured else ""
         blank = "" if column.default.startswith("required") else f" Blank: {column.default or 'unknown'}."
-        lines.append(f"{f'{key}:':{width}}# {column.meaning.rstrip('.')}{unit}.{how}{blank}\n")
+        lines.append(f"{f'{key}:':{width}}# {column.meaning}{how}{blank}\n")
     return f"""\
 # What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
 # a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
@@ -299,7 +301,8 @@ def read_block(text: str) -> list[list[str]]:
         delimiter = ","
     else:
         wide = any(re.search(r"\S {2,}\S", line) for line in lines)
-        return [re.split(r" {2,}" if wide else r"\s+", line.strip()) for line in lines]
+        lines = [re.sub(rf"(\d) ((?:{'|'.join(UNITS)})\b)", r"\1\2", line.strip()) for line in lines]
+        return [re.split(r" {2,}" if wide else r"\s+", line) for line in lines]
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
 
 
@@ -320,22 +323,28 @@ def place_block(
     words, row_named = _header_words(columns), _rows_by_name(rows)
 
     def column_named(word: str) -> str:
-        return words.get(re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_"), "")
+        plain = re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_")
+        inside = (known for known in words if len(known) > 2 and f"_{known}_" in f"_{plain}_")
+        return words.get(plain) or words.get(max(inside, key=len, default=""), "")
 
     # Notes may have sentences above their table, which begins with its header or the line of the first recording.
     lines = [line for line in text.splitlines() if line.strip()]
     named = (i for i, line in enumerate(lines) if any(f"_{name}_" in f"_{_plain(line)}_" for name in row_named))
     table = next(named, 0)
     known = [sum(bool(column_named(word)) for word in re.split(r"[\s,;|]+", line)) for line in lines[:table]]
-    table = table - 1 - known[::-1].index(max(known)) if any(known) else table
+    # A header has at least two known words: a sentence may have one, such as psi.
+    table = table - 1 - known[::-1].index(max(known)) if max(known, default=0) > 1 else table
     if table:
         notes.append(f"{table} line{'s'[: table > 1]} above the table: left out.")
     block = read_block("\n".join(lines[table:]))
     first = block[0] if block else []
     header = [column_named(word) for word in first]
-    if any(header) and not any(_NUMBER.fullmatch(word) for word in first):
+    if any(header) and not any(re.match(r"[-+]?\d", word) for word in first):
+        if header.count("trial") > 1:  # beside another word for the recording, film is that of the vine
+            film = words["thickness"]
+            header = [film if word.lower() == "film" else name for word, name in zip(first, header, strict=True)]
         unknown = [word for word, name in zip(first, header, strict=True) if word and not name]
-        notes += [f"No column is named “{word}”: left out." for word in unknown]
+        notes += [f"No column is named “{word}”: left out; {did_you_mean(word, COLUMNS)}." for word in unknown]
         block = block[1:]
         name_place = header.index("trial") if "trial" in header else None
     else:
@@ -364,7 +373,10 @@ def place_block(
         for name, cell in zip(header, cells, strict=False):
             if cell and name and name != "trial":
                 column = column_of(name, columns)
-                placed.append((row, column, in_unit_of(column, name, cell, decimal)))
+                try:
+                    placed.append((row, column, in_unit_of(column, name, cell, decimal)))
+                except InputError as error:
+                    notes.append(f"“{cell}” {error}: left out.")
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
     if name_place is not None and placed and without:
         notes.append(f"No line for {', '.join(without)}: left as they are.")

@@ -38,7 +38,7 @@ from vinetrack.pages.campaign import (
     predict_choice,
     read_campaign,
 )
-from vinetrack.pages.controls import EffectPanel, ProposalPanel, TrialSelector
+from vinetrack.pages.controls import EffectPanel, TrialSelector
 from vinetrack.pages.draft_files import save_model
 from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
 from vinetrack.pages.plots import (
@@ -175,7 +175,6 @@ class Page:
         self.film = FilmPanel(campaign, self.document, self.plots.set_instant)
         self.saved = Div(name="saved")
         save = beside(button("Save the model to experiment.yaml", "save", self._save))
-        self.proposal = ProposalPanel(self)
         self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
@@ -183,7 +182,7 @@ class Page:
         actions = Column(buttons, name="actions")
         texts = [self.headline, self.status, self.numbers, self.tied, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
-        panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
+        panels = [self.selector.root, self.panel.root, self.film.root]
         for root in (*texts, *figures, *panels, actions, Column(save, self.saved, name="keep")):
             self.document.add_root(root)
         style, script = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "screen.js"))
@@ -374,7 +373,6 @@ class Page:
 
     def _update_status(self) -> None:
         """Update the status line."""
-        self.proposal.show()
         background, text = self.background, ""
         if self._job is not None:
             # A fit starts from that of the model in use.
@@ -406,7 +404,6 @@ class Page:
         with suppress(ValueError):
             self.background.listeners.remove(self._on_background_change)
         self.film.close()
-        self.proposal.close()
         if self._job is not None:
             self._job.cancel()
 

@@ -13,24 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+from bokeh import models as bk
 from bokeh.document import Document
-from bokeh.models import (
-    Button,
-    CategoricalColorMapper,
-    Column,
-    ColumnDataSource,
-    CustomJSTickFormatter,
-    Div,
-    HoverTool,
-    LinearColorMapper,
-    Range1d,
-    Row,
-    Select,
-    Slider,
-    Span,
-    TapTool,
-    UIElement,
-)
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from bokeh.themes import Theme
@@ -85,25 +69,25 @@ def theme() -> Theme:
 def vine_colour() -> dict[str, Any]:
     """Return the colour of glyphs with a column `colour`: a palette, so that a page can change it."""
     colours = list(VINE_COLOURS)
-    return {"field": "colour", "transform": CategoricalColorMapper(factors=colours, palette=colours)}
+    return {"field": "colour", "transform": bk.CategoricalColorMapper(factors=colours, palette=colours)}
 
 
-def set_text(piece: Div, text: str) -> None:
+def set_text(piece: bk.Div, text: str) -> None:
     """Change a piece of HTML only if it differs, because whatever is sent is drawn again."""
     if piece.text != text:
         piece.text = text
 
 
-def button(label: str, name: str, does: Callable[[], None], **options: Any) -> Button:
+def button(label: str, name: str, does: Callable[[], None], **options: Any) -> bk.Button:
     """Return a button that calls `does` when it is clicked."""
-    made = Button(label=label, name=name, **options)
+    made = bk.Button(label=label, name=name, **options)
     made.on_click(does)
     return made
 
 
-def beside(*parts: UIElement, css: str = ":host { gap: 6px; }") -> Row:
+def beside(*parts: bk.UIElement, css: str = ":host { gap: 6px; }") -> bk.Row:
     """Return parts beside each other."""
-    return Row(*parts, stylesheets=[css])
+    return bk.Row(*parts, stylesheets=[css])
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
@@ -170,11 +154,11 @@ class Plots:
         styles = vine_styles(campaign.vines)
         # The colour of each condition is that of its vine, as in every figure.
         self._colour = {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
-        self._measured = ColumnDataSource(self._lines(()))
-        self._reference = ColumnDataSource({"xs": [], "ys": []})
-        self._model = ColumnDataSource({"xs": [], "ys": []}, name="model_curves")
-        self._residuals = ColumnDataSource(self._lines(()), name="residual_curves")
-        self._bars = ColumnDataSource(self._error_bars({}, {}, ()), name="error_bars")
+        self._measured = bk.ColumnDataSource(self._lines(()))
+        self._reference = bk.ColumnDataSource({"xs": [], "ys": []})
+        self._model = bk.ColumnDataSource({"xs": [], "ys": []}, name="model_curves")
+        self._residuals = bk.ColumnDataSource(self._lines(()), name="residual_curves")
+        self._bars = bk.ColumnDataSource(self._error_bars({}, {}, ()), name="error_bars")
         self.motion, self.residual = self._draw_motion(), self._draw_residual()
         self.errors = self._draw_errors()
 
@@ -189,24 +173,24 @@ class Plots:
         model = fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
         values = [("since release", "$x{0.0} ms"), ("growth", "$y{0.0} mm")]
         for drawn, tips in ((lines, [("trial", "@trial"), ("", "@condition")]), (model, [("", "model")])):
-            fig.add_tools(HoverTool(renderers=[drawn], tooltips=[*tips, *values], line_policy="interp"))
-        self.instant = Span(dimension="height", line_color=INK, line_width=1, line_alpha=0.5, visible=False)
+            fig.add_tools(bk.HoverTool(renderers=[drawn], tooltips=[*tips, *values], line_policy="interp"))
+        self.instant = bk.Span(dimension="height", line_color=INK, line_width=1, line_alpha=0.5, visible=False)
         fig.add_layout(self.instant)
         return fig
 
     def _draw_residual(self) -> Any:
-        fig = plot(230, "growth (mm)", "measured − model (mm)", name="residual", y_range=Range1d(-1, 1))
-        fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
+        fig = plot(230, "growth (mm)", "measured − model (mm)", name="residual", y_range=bk.Range1d(-1, 1))
+        fig.add_layout(bk.Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
         lines = fig.multi_line("xs", "ys", source=self._residuals, line_color=vine_colour(), line_width=1.4)
         tips = [("trial", "@trial"), ("", "@condition"), ("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
-        fig.add_tools(HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"))
+        fig.add_tools(bk.HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"))
         return fig
 
     def _draw_errors(self) -> Any:
         names = list(reversed(self.campaign.conditions))
         # Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height
         height = 70 + 25 * max(len(names), 2)
-        fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=Range1d(0, 1))
+        fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=bk.Range1d(0, 1))
         common = {"y": "condition", "source": self._bars}
         pale = {"fill_color": GRID, "fill_alpha": 0.65, "line_color": MUTED, "line_alpha": 0.5}
         held = fig.hbar(right="before", height=0.8, **pale, **common)
@@ -217,11 +201,11 @@ class Plots:
             drawn.nonselection_glyph = drawn.selection_glyph = None
         columns = {"now": "now", "for comparison": "before", "an adequate model, at most": "highest"}
         tips = [("", "@label"), *((words, f"@{column}{{0.000}} mm") for words, column in columns.items())]
-        fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, held]))
+        fig.add_tools(bk.HoverTool(renderers=[bars], tooltips=tips), bk.TapTool(renderers=[bars, held]))
         self._bars.selected.on_change("indices", self._tapped)
         labels = [self.campaign.labels[name] for name in names]
         code = "return labels[names.indexOf(tick)] ?? tick"
-        fig.yaxis.formatter = CustomJSTickFormatter(args={"names": names, "labels": labels}, code=code)
+        fig.yaxis.formatter = bk.CustomJSTickFormatter(args={"names": names, "labels": labels}, code=code)
         fig.ygrid.visible = False
         # Toolbar buttons would cover the first bar; tapping needs none.
         fig.toolbar_location = None
@@ -402,21 +386,19 @@ class FilmPanel:
         self._film: Film | None = None
         self._job: Job[tuple[int, float], Film] | None = None
         self._view: RecordingView | None = None
-        self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
-        self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial")
-        self.play = button("▶ play", "film_play", self._toggle_play, width=84)
+        self.trial_select = bk.Select(options=names, value=names[0], width=220, title="trial", name="film_trial")
         numbers = {"start": 0, "end": 1, "value": 0, "step": 1, "sizing_mode": "stretch_width"}
-        self.frame = Slider(**numbers, title="frame", name="film_frame", css_classes=["frame"])
-        self.caption = Div(name="film_caption")
-        self._picture = ColumnDataSource({"image": []}, name="film_picture")
-        self._edges = ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
+        self.frame = bk.Slider(**numbers, title="frame", name="film_frame", css_classes=["frame"])
+        self.caption = bk.Div(name="film_caption")
+        self._picture = bk.ColumnDataSource({"image": []}, name="film_picture")
+        self._edges = bk.ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
         self.figure = self._draw()
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, _new: self._show_frame())
         css = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
-        controls = Row(self.trial_select, self.play, self.frame, stylesheets=[css], sizing_mode="stretch_width")
-        self.root = Column(controls, self.figure, self.caption, name="film")
+        controls = bk.Row(self.trial_select, self.frame, stylesheets=[css], sizing_mode="stretch_width")
+        self.root = bk.Column(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
         fig = figure(
@@ -424,8 +406,8 @@ class FilmPanel:
             aspect_ratio=3.0,
             tools="",
             toolbar_location=None,
-            x_range=Range1d(0, 1),
-            y_range=Range1d(1, 0),
+            x_range=bk.Range1d(0, 1),
+            y_range=bk.Range1d(1, 0),
             visible=False,
             name="film_figure",
             min_border=0,
@@ -433,7 +415,7 @@ class FilmPanel:
         )
         fig.axis.visible = False
         fig.grid.visible = False
-        greys = LinearColorMapper(palette=list(Greys256), low=0, high=255)
+        greys = bk.LinearColorMapper(palette=list(Greys256), low=0, high=255)
         place = {"x": -0.5, "y": -0.5, "dw": 1, "dh": 1, "level": "image"}
         self._image = fig.image("image", source=self._picture, color_mapper=greys, **place)
         fig.multi_line("xs", "ys", source=self._edges, line_color="black", line_width=4.5, line_alpha=0.45)
@@ -448,12 +430,11 @@ class FilmPanel:
 
     def show_trial(self, name: str) -> None:
         """Show another trial: decode its recording, or show why there is none."""
-        self._stop()
         self.close()
         if self.trial_select.value != name:
             self.trial_select.value = name
             return
-        self.figure.visible = self.play.visible = self.frame.visible = False
+        self.figure.visible = self.frame.visible = False
         view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
         if isinstance(view, str):
             self.caption.text = f"<p>{escape(view)}</p>"
@@ -478,7 +459,7 @@ class FilmPanel:
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
         self._image.glyph.update(dw=width, dh=height)
         self.figure.aspect_ratio = width / height
-        self.figure.visible = self.play.visible = self.frame.visible = True
+        self.figure.visible = self.frame.visible = True
         known = np.flatnonzero(view.track["edge_px"].notna())
         last = len(film.frames) - 1
         # The first frame that is shown: half-way along the motion
@@ -536,25 +517,6 @@ class FilmPanel:
                 for key, value in zip(lines, (*ends, colour, dash), strict=True):
                     lines[key].append(value)
         self._edges.data = lines
-
-    def _toggle_play(self) -> None:
-        if self._playing is not None:
-            self._stop()
-            return
-        self.play.label = "❚❚ pause"
-
-        def advance() -> None:
-            following = int(self.frame.value) + max(int(self.frame.end) // 150, 1)
-            self.frame.value = following if following <= self.frame.end else 0
-
-        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
-        self._playing = self._document.add_periodic_callback(advance, 70)
-
-    def _stop(self) -> None:
-        if self._playing is not None:
-            self._document.remove_periodic_callback(self._playing)
-            self._playing = None
-        self.play.label = "▶ play"
 
     def close(self) -> None:
         """Stop decoding, and let the recording go."""

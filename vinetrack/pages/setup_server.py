@@ -31,24 +31,7 @@ from vinetrack.experiment.settings import in_sheet_units, read_experiment_settin
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
 from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.style import render
-from vinetrack.pages.draft_files import (
-    NOTES,
-    Draft,
-    cells_of,
-    column_of,
-    draft_folder,
-    files_stamp,
-    list_pictures,
-    list_tables,
-    open_draft,
-    place_block,
-    quantity,
-    read_sheet,
-    shared_values,
-    with_shared,
-    with_value,
-    write_draft,
-)
+from vinetrack.pages import draft_files as files
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
@@ -92,12 +75,10 @@ def first_frame(path: Path) -> NDArray[Any]:
     return frame
 
 
-def board_in(path: Path, name: str) -> dict[str, Any] | None:
-    """The printed board in a picture or at the beginning of a film, as `experiment.yaml` names it, without sizes; None
-    if there is no board.
-    """
-    if (target := find_board(first_frame(path))) is None:
-        return None
+def target_in(picture: NDArray[Any], name: str) -> dict[str, Any] | None:
+    """The printed board in a picture, as `experiment.yaml` names it, without sizes; else the marks of a ruler."""
+    if (target := find_board(picture)) is None:
+        return ruler_in(picture)
     markers = {"dictionary": target.dictionary, "marker_share": round(target.marker_share, 3)}
     board = {"kind": target.kind, "image": name, "squares": list(target.squares)}
     return board | (markers if target.kind == "charuco" else {})
@@ -177,12 +158,105 @@ def _strip_url(fig: Figure) -> str:
 
 
 # ------------------------------------------------------------------------------
+# Marks of a ruler in a picture: a line along which grey levels repeat. The picture is turned degree by degree, and the
+# strongest line in the spectrum of a row, against that of other rows, proposes a direction and a spacing. Along it
+# every mark must look like the others, which tells a ruler from texture; the phase of the spacing gives their places.
+
+FEWEST_SPACINGS = 20  # Chosen: in texture up to 13 places look alike
+
+
+def ruler_in(picture: NDArray[Any]) -> dict[str, Any] | None:
+    """Find the longest row of equally spaced marks in a picture of shape (height, width): two far marks, px, the number
+    of spacings between them, and by what share the last is longer than the first. None if there is no such row.
+    """
+    import cv2
+
+    grey = picture.astype(np.float32)
+    small = min(1.0, 1000 / max(grey.shape))  # 1000: size at which directions are searched, px (chosen)
+    shrunk = cv2.resize(grey, None, fx=small, fy=small, interpolation=cv2.INTER_AREA)
+    shrunk = shrunk - cv2.GaussianBlur(shrunk, (0, 0), 0.03 * max(shrunk.shape))
+    shrunk = np.tanh(shrunk / (2 * shrunk.std() + 1e-6))  # one strong edge must not outweigh marks
+    middle, side = (np.array(shrunk.shape[::-1]) - 1) / 2, math.ceil(math.hypot(*shrunk.shape))
+    lines = []
+    for degrees in range(-90, 90):
+        turn: NDArray[Any] = np.array(cv2.getRotationMatrix2D(middle.tolist(), degrees, 1.0))
+        turn[:, 2] += (side - 1) / 2 - middle
+        rows = cv2.blur(cv2.warpAffine(shrunk, turn, (side, side)), (1, 3))[1::2]
+        power = np.abs(np.fft.rfft(rows, axis=1)) ** 2
+        power /= cv2.blur(power.mean(axis=0)[None], (9, 1)) + 1e-9 * power.max() + 1e-9
+        power[:, :FEWEST_SPACINGS] = 0.0
+        row, k = np.unravel_index(np.argmax(power), power.shape)
+        back = cv2.invertAffineTransform(turn)
+        lines.append((float(power[row, k]), back @ [side / 2, 2 * row + 1, 1] / small, back[:, 0], k / side * small))
+    lines = sorted(lines, key=lambda line: -line[0])[:12]  # 12: lines looked at (chosen)
+    found = [ruler for line in lines if (ruler := _marks_along(grey, *line[1:])) is not None]
+    return max(found, key=lambda ruler: ruler["spacings"], default=None)
+
+
+def _marks_along(grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], rate: float) -> dict[str, Any] | None:
+    """The marks along a line through a point, about `rate` a pixel; the line is turned until it is square to them."""
+    reach = sum(grey.shape) // 2
+    u = np.arange(-reach, reach + 1)
+    for _ in range(4):  # 4: turns of the line; the last is below 0.01 degrees (measured)
+        side = np.array([-way[1], way[0]])
+        levels = np.array([_levels(grey, start + aside * side, way, u, 2 / rate) for aside in (-2, 0, 2)])
+        level = levels.sum(axis=0)
+        near = slice(int(0.95 * rate * u.size), int(1.05 * rate * u.size) + 2)
+        rate = (near.start + int(np.argmax(np.abs(np.fft.rfft(level)[near])))) / u.size
+        # What is strongest may be a multiple of the marks' own rate.
+        strength = {n: abs(np.exp(-2j * np.pi * rate / n * u) @ level) for n in (3, 2, 1)}
+        rate /= next(n for n in strength if strength[n] > 0.3 * strength[1])
+        if u.size * rate < FEWEST_SPACINGS:
+            return None
+        window = np.hanning(round(4 / rate) | 1)
+        waves = [np.convolve(one * np.exp(-2j * np.pi * rate * u), window, "same") for one in (*levels, level)]
+        strong = np.abs(waves[3]) > 0.5 * np.quantile(np.abs(waves[3]), 0.98)
+        first, last = max(np.flatnonzero(np.diff(np.r_[0, strong, 0])).reshape(-1, 2), key=np.ptp, default=(0, 1))
+        run, before = slice(first + round(1 / rate), last - round(1 / rate)), (start, way)
+        lean = np.angle(waves[2][run] @ waves[0][run].conj()) / (8 * np.pi * rate)
+        start, way = start + u[(first + last) // 2] * way, (way + lean * side) / math.hypot(1, lean)
+    start, way = before
+    at, level_there = u[run], level[run]
+    if (last - first) * rate < FEWEST_SPACINGS + 2:
+        return None
+    phase = np.polynomial.Polynomial.fit(at, np.unwrap(np.angle(waves[3][run])) / (2 * np.pi), 2)
+    # Marks are what is narrow: dark on light, or light on dark.
+    count = rate * at + phase(at) + (0.5 if ((level_there - level_there.mean()) ** 3).sum() < 0 else 0.0)
+    places = np.interp(np.arange(math.ceil(count[0]), math.floor(count[-1]) + 1), count, at)
+    shapes = np.interp(places[1:-1, None] + np.arange(-8, 8) / (16 * rate), u, level)
+    rest = shapes.sum(axis=0) - shapes
+    likeness = np.median([np.corrcoef(*pair)[0, 1] for pair in zip(shapes, rest, strict=True)])
+    if len(places) <= FEWEST_SPACINGS or not likeness > 0.85:  # chosen
+        return None
+    gaps = np.diff(places)
+    return {
+        "from_px": (start + places[0] * way).round(2).tolist(),
+        "to_px": (start + places[-1] * way).round(2).tolist(),
+        "spacings": len(gaps),
+        "uneven": float(gaps[-1] / gaps[0] - 1),
+    }
+
+
+def _levels(
+    grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], u: NDArray[Any], smooth_px: float
+) -> NDArray[Any]:
+    """Grey levels along a line, without their slow change; 0 outside the picture."""
+    import cv2
+
+    x, y = (start[:, None] + u * way[:, None]).astype(np.float32)[:, None]
+    seen = (x > 0) & (x < grey.shape[1] - 1) & (y > 0) & (y < grey.shape[0] - 1)
+    level = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    level = np.where(seen, level - cv2.GaussianBlur(level, (0, 0), smooth_px, sigmaY=0.1), 0.0)[0]
+    return level.clip(-3 * level.std(), 3 * level.std())
+
+
+# ------------------------------------------------------------------------------
 # Data exchanged between page and files: available columns, cells, settings, and problems with their fields.
 
 
 def page_state(folder: Path) -> dict[str, Any]:
     """Return the initial state of the page, of JSON types."""
-    draft, present = open_draft(folder), read_sheet(folder)
+    draft, present = files.open_draft(folder), files.read_sheet(folder)
     content = parse_yaml(draft.settings, SETTINGS).content
     sheet = draft.sheet
     # Columns that the page shows whether or not the sheet has them
@@ -191,7 +265,7 @@ def page_state(folder: Path) -> dict[str, Any]:
     for name in [name for name in COLUMNS if name not in ("trial", "video")]:
         units = [split_unit(name)[1], *other_units(name).values()]
         known[name] = {key: getattr(COLUMNS[name], key) for key in ("kind", "meaning", "measured", "default", "shared")}
-        known[name] |= {"base": name, "quantity": quantity(name), "units": units if len(units) > 1 else []}
+        known[name] |= {"base": name, "quantity": files.quantity(name), "units": units if len(units) > 1 else []}
         known |= dict.fromkeys(other_units(name), known[name])
     return {
         "name": folder.resolve().name,
@@ -202,45 +276,47 @@ def page_state(folder: Path) -> dict[str, Any]:
         "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
         "kept": list(present.columns) if present.rows else ["trial", "video", "track"],
-        "unsaved": not (folder / SETTINGS).exists() or not present.rows or cells_of(present) != cells_of(sheet),
-        "shared": {key: str(value) for key, value in shared_values(draft.settings).items()},
+        "unsaved": not (
+            (folder / SETTINGS).exists() and present.rows and files.cells_of(present) == files.cells_of(sheet)
+        ),
+        "shared": {key: str(value) for key, value in files.shared_values(draft.settings).items()},
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
         "corrections": {
             trial: [vars(point) | {"edge_px": round(point.edge_px, 2)} for point in given]
             for trial, given in draft.corrections.items()
         },
-        "pictures": list_pictures(folder),
-        "traces": list_tables(folder),
-        "notes": list_tables(folder, NOTES),
+        "pictures": files.list_pictures(folder),
+        "traces": files.list_tables(folder),
+        "notes": files.list_tables(folder, files.NOTES),
     }
 
 
-def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
+def draft_from_json(folder: Path, content: Mapping[str, Any]) -> files.Draft:
     """Return the draft sent by the page; comments and keys unknown to the page come from the files."""
-    from_files = open_draft(folder)
+    from_files = files.open_draft(folder)
     columns = tuple(map(str, content["sheet"]["columns"]))
     rows = tuple({name: str(row.get(name, "")) for name in columns} for row in content["sheet"]["rows"])
     sheet = replace(from_files.sheet, columns=columns, rows=rows)
-    text = with_shared(from_files.settings, {str(key): str(cell) for key, cell in content["shared"].items()})
+    text = files.with_shared(from_files.settings, {str(key): str(cell) for key, cell in content["shared"].items()})
     present = parse_yaml(text, SETTINGS).content
     for key in ("calibration", "axis"):
         value = content.get(key)
         if value is not None or present.get(key) is not None:
-            text = with_value(text, key, value, SETTINGS)
+            text = files.with_value(text, key, value, SETTINGS)
     corrections = {}
     for trial, points in content.get("corrections", {}).items():
         given = [Correction(int(one["frame"]), str(one["action"]), or_nan(one["edge_px"])) for one in points]
         if given:
             corrections[str(trial)] = tuple(sorted(given, key=lambda correction: correction.frame))
-    return Draft(sheet, text, str(content["stamp"]), corrections)
+    return files.Draft(sheet, text, str(content["stamp"]), corrections)
 
 
-def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
+def draft_problems(folder: Path, draft: files.Draft, thorough: bool = False) -> dict[str, Any]:
     """Return the messages of `vinetrack check` for a draft, of JSON types: `problems`, each with the field concerned,
     `notes`, what was `understood` of each recording, and the text of each file.
     """
-    with draft_folder(folder, draft) as copy:
+    with files.draft_folder(folder, draft) as copy:
         checked = check_folder(copy) if thorough else None
         problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
     return {
@@ -252,7 +328,7 @@ def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[s
     }
 
 
-def _scale_missing(draft: Draft) -> list[Problem]:
+def _scale_missing(draft: files.Draft) -> list[Problem]:
     """The problem that the check of recordings would report for a missing scale."""
     content = parse_yaml(draft.settings, SETTINGS).content
     has_scale = content.get("calibration") is not None or content.get("mm_per_px") is not None
@@ -273,9 +349,9 @@ def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, An
     elif problem.trial:
         field = "cell" if column else "row"
     else:
-        field = "shared" if column_of(column, COLUMNS) in COLUMNS else "whole"
+        field = "shared" if files.column_of(column, COLUMNS) in COLUMNS else "whole"
     told = {key: getattr(problem, key) for key in ("severity", "trial", "code", "of_a_measurement")}
-    return {**told, "field": field, "column": column_of(column, columns), "text": problem.reason}
+    return {**told, "field": field, "column": files.column_of(column, columns), "text": problem.reason}
 
 
 log = logging.getLogger(__name__)
@@ -313,18 +389,18 @@ class Desk:
 
     def track(self, row: int, **content: Any) -> dict[str, Any]:
         """Track the recording of one row of a draft."""
-        with self._tracking, draft_folder(self.folder, draft_from_json(self.folder, content)) as copy:
+        with self._tracking, files.draft_folder(self.folder, draft_from_json(self.folder, content)) as copy:
             return track_row(copy, row, self._keep)
 
     def paste(self, text: str = "", file: str = "", **table: Any) -> dict[str, Any]:
         """Return which cells a pasted block, or a file of notes, would change, and what matches nothing."""
         block = read_text(safe_join(self.folder, file)) if file else text
-        return dict(zip(("cells", "notes"), place_block(block, **table), strict=True))
+        return dict(zip(("cells", "notes"), files.place_block(block, **table), strict=True))
 
     def save(self, **content: Any) -> dict[str, Any]:
         """Write a draft."""
-        written = write_draft(self.folder, draft_from_json(self.folder, content))
-        return {"written": written, "stamp": files_stamp(self.folder)}
+        written = files.write_draft(self.folder, draft_from_json(self.folder, content))
+        return {"written": written, "stamp": files.files_stamp(self.folder)}
 
 
 # Answers by method and path, from the query or the JSON of a request: bytes are a JPEG, text is a style, all else JSON
@@ -337,7 +413,7 @@ ANSWERS: dict[str, Callable[..., bytes | str | Mapping[str, Any] | None]] = {
     "GET thumbnail": lambda desk, recording: desk.picture(recording, 220),
     "GET picture": lambda desk, picture: desk.picture(picture),
     "GET curve": lambda _, points: axis_json(axis_through([point.split(",") for point in points.split(";")])),
-    "GET board": lambda desk, picture: board_in(safe_join(desk.folder, picture), picture),
+    "GET target": lambda desk, picture: target_in(first_frame(safe_join(desk.folder, picture)), picture),
     "POST check": Desk.check,
     "POST paste": Desk.paste,
     "POST track": Desk.track,
@@ -424,8 +500,8 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
 
 def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept."""
-    present, draft = read_sheet(folder), open_draft(folder)
-    written = write_draft(folder, draft)
+    present, draft = files.read_sheet(folder), files.open_draft(folder)
+    written = files.write_draft(folder, draft)
     columns, added = draft.sheet.columns, draft.sheet.rows[len(present.rows) :]
     filled = [name for name in columns if name not in ("trial", "video", "track") and any(r.get(name) for r in added)]
     there = f"{SHEET} and {SETTINGS} of {folder} already contain every recording."
@@ -436,7 +512,10 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     problems = [*check_experiment(folder), *_scale_missing(draft)]
     errors = [problem for problem in problems if problem.severity == "error" and problem.column]
     missing = {problem.column for problem in errors if problem.code in ("missing", "blank")}
-    blanks = [*(column_of(name, columns) for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
+    blanks = [
+        *(files.column_of(name, columns) for name in COLUMNS if name in missing),
+        *sorted(missing - COLUMNS.keys()),
+    ]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
     say(f"Then: vinetrack check {folder}")

@@ -24,7 +24,7 @@ from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTE
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
-from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, RULE_NAMES, VERMILLION, rows
+from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION, rows
 from vinetrack.narrative.diagnosis_text import (
     LAW_METHODS,
     POWER_COLUMNS,
@@ -90,7 +90,9 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     any_colour = re.compile("|".join(colours))
 
     def short(tag: re.Match[str]) -> str:
-        return any_colour.sub(lambda match: colours[match[0]], re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0]))
+        text = re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0])
+        text = text if " C " in text else text.replace(" L ", " ")  # places after a move are lines to them
+        return any_colour.sub(lambda match: colours[match[0]], text)
 
     body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", found[3], flags=re.DOTALL)
     body = re.sub(r"<(?!image)[^>]*>", short, body)  # images are placed by matrices, which need all their decimals
@@ -171,11 +173,19 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     for entry in diagnosis.rounds:
         untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
-        rounds.append({"ranking": ranking_rows(entry), "blind": blind, "of": entry})
+        ranking = ranking_rows(entry)
+        n_below = len(entry.ranking) - len(untestable) - len(ranking)
+        rounds.append({"ranking": ranking, "n_below": n_below, "blind": blind, "of": entry})
     sizes, power = [], diagnosis.power
     wary = [f"Detectable sizes were not computed: {power.wary}."] if power is not None and power.wary else []
     if power is not None and not power.wary:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
+    # Upper limits are valid only if no effect is missing.
+    limits = upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects)
+    hidden = [(*name, limit) for name, limit in limits.items() if name not in {row[:2] for row in sizes}]
+    columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
+    if limits:
+        sizes = [(*row[:2], limits.get(row[:2], "–"), *row[2:]) for row in sizes]
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
@@ -187,9 +197,8 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": rounds,
-        # Upper limits are valid only if no effect is missing.
-        "hidden": upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects),
-        "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes},
+        "hidden": hidden,
+        "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes, "columns": columns},
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
@@ -200,19 +209,16 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
 def ladder_rows(ladder: pd.DataFrame | None) -> list[tuple[str, ...]]:
     """Return the errors of every model of `ladder.csv`, mm."""
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
-    return [
-        (_step(str(row["added"] or ""), row.get("partial")), *(number(1e3 * float(row[key])) for key in keys))
-        for row in ([] if ladder is None else ladder.to_dict("records"))
-    ]
-
-
-def _step(added: str, partial: object = False) -> str:
-    mark = " (partial)" if partial else ""
-    return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
+    shown = []
+    for row in [] if ladder is None else ladder.to_dict("records"):
+        mark = " (partial)" if row.get("partial") else ""
+        step = f"+ {listed_names(row['added'].split('+'))}{mark}" if row["added"] else "initial model"
+        shown.append((step, *(number(1e3 * float(row[key])) for key in keys)))
+    return shown
 
 
 def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
-    """Return the candidates of a round that could be tested."""
+    """Return the candidates of a round that were fitted, that it cannot exclude, or that reach 2 σ."""
     return [
         (
             ("● " if row.in_answer_set else "") + spaced_name(row.effect),
@@ -224,13 +230,13 @@ def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
             "; ".join(part for part in ("" if row.plausible else "not plausible", str(row.reason)) if part),
         )
         for row in entry.ranking
-        if row.status != NOT_TESTABLE
+        if row.status != NOT_TESTABLE and (row.in_answer_set or row.status == REFITTED or abs(row.sigma) >= 2.0)
     ]
 
 
-def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> list[tuple[str, str, str]]:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; `effects` are known by name."""
-    rows = []
+def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> dict[tuple[str, ...], str]:
+    """Return one-sided 95 % upper limits by candidate of a ranking and symbol; `effects` are known by name."""
+    limits: dict[tuple[str, ...], str] = {}
     for row in ranking:
         named = effects[row.effect].parameters if row.effect in effects else ()
         of = {parameter.name: (parameter.symbol, parameter.unit) for parameter in named}
@@ -240,8 +246,8 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
                 short = name.split(".")[-1]
                 symbol, unit = of.get(short) or (short, "SI")
                 shown, factor = display_unit(unit)
-                rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
-    return rows
+                limits[spaced_name(row.effect), symbol] = f"{number(factor * largest)} {shown}".strip()
+    return limits
 
 
 TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
@@ -446,7 +452,7 @@ MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single tria
 
 def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int]:
     """Return all trials for the template, and how many of them have their figures left out for size."""
-    entries, left_out, weight, windows = [], 0, 0, content["windows"]
+    entries, left_out, weight = [], 0, 0
     for k, row in enumerate(rows(content["trials"])):
         name, kinds = row.trial, ("strips", "motions", "flags")
         strip, motion, flags = (None if row.status == "failed" else content[kind].get(name) for kind in kinds)
@@ -460,7 +466,6 @@ def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int
             "row": row,
             "frames": count_frames(flags) if flags else "",
             "clip": content["clips"].get(name, ""),
-            "windows": list(rows(windows[windows["trial"] == name])),
         }
         entries.append({**entry, "strip": strip, "motion": motion})
     return entries, left_out
@@ -528,7 +533,6 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     return {
         "name": experiment.name,
         "trials": trials,
-        "windows": read_result(results.steady),
         "damping": read_json(results.damping),
         "provenance": provenance,
         "figures": _figures(tables, campaign_figures().values()),
@@ -557,7 +561,7 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
 
 
 def _figures(tables: FigureTables, figures: Iterable[RegisteredFigure]) -> list[ReportFigure]:
-    """Return the drawn figures with their data: a file of the results, or a table of its own with five digits."""
+    """Return the drawn figures with their data: a short file of the results, or a table of its own with five digits."""
     shown = []
     for one in figures:
         if picture := _picture(partial(tables.results.figure, one.name)):
@@ -566,6 +570,7 @@ def _figures(tables: FigureTables, figures: Iterable[RegisteredFigure]) -> list[
                 data = (tables.results.folder / name).read_text(encoding="utf-8")
             elif name:
                 name, data = f"{one.name}.csv", _csv(getattr(tables, name))
+            data = data if len(data) < 20_000 else ""  # as a page carries it (chosen); all else lies in the results
             shown.append(ReportFigure(one.name, one.title, one.caption, picture, name, data))
     return shown
 
@@ -629,10 +634,8 @@ def build_report(content: dict[str, Any]) -> str:
             "laws": sorted(laws, key=lambda one: (one[1]["diameter_mm"], one[1]["thickness_um"], one[0])),
             "final": content["diagnosis"],
             "diagnosis": diagnosis_section(content),
-            "power_columns": POWER_COLUMNS,
             "figures": figures,
             "trials": trials,
-            "rule_names": RULE_NAMES,
             "n_left_out": n_left_out,
             "calibrations": calibration_table(content["calibrations"]),
             "run": content["provenance"]["settings"],

@@ -1,5 +1,6 @@
 // The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
-import {$, ask, changed, decimals, el, listed, numberOf, round, state, url} from "./state.js";
+import {$, ask, changed, decimals, el, listed, numberOf, round, sharedValue, state, url} from "./state.js";
+import {drawTable} from "./table.js";
 
 const view = {source: "", frame: 0, image: null, width: 1, height: 1, edge: null};
 const LENS = 7; // Screen pixels per pixel of the picture.
@@ -36,15 +37,20 @@ export async function showRecording() {
 
 function drawSources() {
   $("source").replaceChildren(el("option", {value: ""}, row()?.video || "no recording"), ...state.pictures.map((name) => el("option", {value: name, selected: name === view.source}, name)));
-  $("source").onchange = (event) => { view.source = event.target.value; drawPicture(); };
+}
+
+// A picture that is no recording is there for its scale.
+function showPicture(name) {
+  view.source = name;
+  document.querySelector("input[name=tool][value=scale]").checked ||= Boolean(name);
+  drawSources();
+  drawPicture();
+  if (name && !marks.from_px && !board) findTarget();
 }
 
 const imageOf = (frame) => (view.source ? url("api/picture", {picture: view.source}) : url("api/frame", {recording: row().video, frame}));
 
-function showNumber() {
-  $("frame").value = view.frame;
-  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
-}
+const showNumber = () => { [$("frame").value, $("frame-at").textContent] = [view.frame, `${view.frame} of ${state.clip.frames - 1}`]; };
 
 export function showFrame(frame, edge = null) {
   view.frame = Math.max(0, Math.min(state.clip.frames - 1, frame));
@@ -105,10 +111,7 @@ function setAxis(axis, scope) {
   redraw();
 }
 
-function redraw() {
-  drawOver();
-  drawTools();
-}
+const redraw = () => { drawOver(); drawTools(); };
 
 // Change points of the axis, in the scope that it has or that is chosen.
 function changeAxis(points) {
@@ -150,13 +153,6 @@ function removeBend(i) {
 const AXIS_ENDS = {from_px: "Start of the growth axis", to_px: "End of the growth axis"};
 const bendWords = (i) => `Bend ${i + 1} of the growth axis`;
 const focusOn = (words) => document.querySelector(`[data-handle="${words}"]`)?.focus();
-
-function clearAxis() {
-  if (row().axis) row().axis = "";
-  else state.axis = null;
-  changed();
-  redraw();
-}
 
 // ---- what is drawn over the picture ------------------------------------------------------------------------------
 
@@ -260,7 +256,7 @@ function lens(event) {
 // ---- the scale ---------------------------------------------------------------------------------------------------
 
 const marks = {from_px: null, to_px: null};
-let board = null;
+let [board, ruler] = [null, null];
 
 export function readCalibration() {
   const given = state.calibration ?? {kind: "two_points"};
@@ -283,12 +279,15 @@ const MARKS = {from_px: "First ruler mark", to_px: "Second ruler mark"};
 
 function setMark(end, point) {
   marks[end] = rounded(point);
+  ruler = null;
   writeScale();
 }
 
 function drawMarks(over, unit) {
   const [from, to] = [marks.from_px, marks.to_px];
-  if (from && to) over.append(el("line", {class: "ruler-line", x1: from[0], y1: from[1], x2: to[0], y2: to[1], "stroke-width": 1.5 * unit}));
+  // A dot on every mark that was counted
+  const dots = ruler && {pathLength: ruler.spacings, "stroke-dasharray": "0 1", "stroke-linecap": "round"};
+  if (from && to) over.append(el("line", {class: "ruler-line", x1: from[0], y1: from[1], x2: to[0], y2: to[1], "stroke-width": (ruler ? 3 : 1.5) * unit, ...dots}));
   for (const [end, words] of Object.entries(MARKS)) {
     if (!marks[end]) continue;
     const [x, y] = marks[end];
@@ -311,30 +310,32 @@ function writeScale() {
   redraw();
 }
 
-async function findBoard() {
+async function findTarget() {
   const picture = view.source || row().video;
-  $("board").replaceChildren(el("span", {class: "busy"}, "looking …"));
+  $("target").replaceChildren(el("span", {class: "busy"}, "looking …"));
   try {
-    const found = await ask(url("api/board", {picture}));
-    board = found ?? board;
-    suggestMarker();
+    const found = await ask(url("api/target", {picture}));
+    $("target").textContent = found ? "" : `No row of marks and no printed board found in ${picture}: click two marks.`;
+    if (!found) return;
+    document.querySelector(`input[name=scale][value=${found.squares ? "board" : "two_points"}]`).checked = true;
+    if (found.squares) board = found;
+    else Object.assign(marks, {from_px: rounded(found.from_px), to_px: rounded(found.to_px)});
+    ruler = found.squares ? null : found;
+    suggest();
     writeScale();
-    if (!found) $("board").textContent = `No printed board found in ${picture}: it must be fully visible, in focus and not mirrored.`;
   } catch (error) {
-    $("board").textContent = error.message;
+    $("target").textContent = error.message;
   }
 }
 
-function suggestMarker() {
-  const side = numberOf($("square").value);
-  if (side && board?.marker_share) $("marker").value = round(side * board.marker_share, 1);
+// What follows from the size of a square, and from that of a spacing
+function suggest() {
+  const [square, spacing] = ["square", "spacing"].map((id) => numberOf($(id).value));
+  if (square && board?.marker_share) $("marker").value = round(square * board.marker_share, 1);
+  if (spacing && ruler) $("length").value = round(spacing * ruler.spacings, 4);
 }
 
 // ---- words below the picture -------------------------------------------------------------------------------------
-
-function show(shown) {
-  for (const [id, wanted] of Object.entries(shown)) $(id).hidden = !wanted;
-}
 
 export function drawTools() {
   if (!state.clip) return;
@@ -344,12 +345,16 @@ export function drawTools() {
     all: "Given for all trials, in experiment.yaml.", trial: `Given for ${row().trial} alone, in its row.`,
   };
   $("axis-from").textContent = from[axis?.given ?? ""];
+  const turned = axis && !row().growth_angle_deg && !sharedValue("growth_angle_deg") ? Math.abs(Math.atan2(axis.to_px[0] - axis.from_px[0], axis.to_px[1] - axis.from_px[1])) * 180 / Math.PI : 0;
+  $("turned-words").textContent = `In the picture growth runs ${turned < 135 ? "level" : "upwards"}. How did the vine grow?`;
   $("axis-ends").textContent = axis ? `${[axis.from_px, axis.to_px].map((end) => rounded(end).join(", ")).join(" to ")} px` : "";
   if (axis?.given) $("axis-scope").value = axis.given;
   const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
   $("moved-points").textContent = moved ? `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.` : "";
-  show({"draw-axis": !axis, "add-bend": axis, straighten: axis?.via_px?.length, "clear-axis": axis?.given, again: marks.from_px, "board-sizes": board, "marker-size": board?.dictionary});
-  $("marks-step").textContent = !marks.from_px ? "Click the first mark of a ruler that lies in the plane of growth." : !marks.to_px ? "Click the second mark, as far away as the ruler allows." : "Drag a mark, or move it with the arrow keys.";
+  const shown = {turned: turned > 45, "draw-axis": !axis, "add-bend": axis, straighten: axis?.via_px?.length, "clear-axis": axis?.given, again: marks.from_px, one: ruler, "board-sizes": board, "marker-size": board?.dictionary};
+  for (const [id, wanted] of Object.entries(shown)) $(id).hidden = !wanted;
+  $("marks-step").textContent = !marks.from_px ? "Click the first mark of a ruler that lies in the plane of growth." : !marks.to_px ? "Click the second mark, as far away as the ruler allows." : ruler ? `A dot lies on each of ${ruler.spacings + 1} marks found: how far is it from one to the next?` : "Drag a mark, or move it with the arrow keys.";
+  if (ruler && Math.abs(ruler.uneven) > 0.02) $("marks-step").textContent += ` The last spacing is ${round(100 * ruler.uneven)} % longer than the first: the ruler was not square to the camera.`;
   if (board) $("board").textContent = `${board.dictionary ? "ChArUco board" : "Checkerboard"}, ${board.squares.join(" × ")} squares${board.dictionary ? ` of ${board.dictionary}` : ""} in ${board.image}`;
   const apart = marks.to_px ? Math.hypot(marks.to_px[0] - marks.from_px[0], marks.to_px[1] - marks.from_px[1]) : null;
   const {mm_per_px, length_mm} = state.calibration ?? {}, scale = length_mm ? length_mm / apart : mm_per_px, words = [];
@@ -369,16 +374,15 @@ export function drawProblems() {
   }
 }
 
-function drawAcross() {
-  const {width, height} = state.clip;
-  setAxis({from_px: [0.1 * width, height / 2], to_px: [0.9 * width, height / 2]}, $("axis-scope").value);
-}
-
 $("frame").oninput = (event) => showFrame(Number(event.target.value));
-$("tools").oninput = redraw;
+$("source").onchange = (event) => showPicture(event.target.value);
+$("tools").oninput = () => (chosen("tool") === "scale" && !state.calibration && !marks.from_px && state.pictures.length ? showPicture(state.pictures[0]) : redraw());
+$("turned").onclick = ({target}) => { if (target.value) { state.shared.growth_angle_deg = target.value; changed(); drawTable(); redraw(); } };
 $("axis-scope").onchange = (event) => { if (currentAxis()?.given) setAxis(currentAxis(), event.target.value); };
-$("square").oninput = suggestMarker; // before the scale is written
+$("square").oninput = $("spacing").oninput = suggest; // before the scale is written
 $("scale-tool").oninput = writeScale;
-const again = () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); };
-const clicks = {"draw-axis": drawAcross, "add-bend": addBend, straighten: () => changeAxis({via_px: []}), "clear-axis": clearAxis, again, "find-board": findBoard};
+const clearAxis = () => { if (row().axis) row().axis = ""; else state.axis = null; changed(); redraw(); };
+const drawAcross = () => setAxis({from_px: [0.1 * state.clip.width, state.clip.height / 2], to_px: [0.9 * state.clip.width, state.clip.height / 2]}, $("axis-scope").value);
+const again = () => { Object.assign(marks, {from_px: null, to_px: null}); ruler = null; writeScale(); };
+const clicks = {"draw-axis": drawAcross, "add-bend": addBend, straighten: () => changeAxis({via_px: []}), "clear-axis": clearAxis, again, "find-target": findTarget};
 for (const [id, act] of Object.entries(clicks)) $(id).onclick = act;

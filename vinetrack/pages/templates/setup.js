@@ -12,9 +12,7 @@ function choose(i) {
   showRecording();
 }
 
-function showWhole(extra = []) {
-  $("whole").replaceChildren(...listed([...extra, ...state.problems.filter((problem) => problem.field === "whole")]));
-}
+const showWhole = (extra = []) => $("whole").replaceChildren(...listed([...extra, ...state.problems.filter((problem) => problem.field === "whole")]));
 
 function showState() {
   const errors = state.problems.filter((problem) => problem.severity === "error").length;
@@ -31,14 +29,15 @@ function showState() {
   $("save").disabled = !state.dirty;
 }
 
-let turn = 0;
+let [turn, comparing] = [0, -1];
 async function check(thorough = false) {
   const mine = ++turn;
   settle();
-  if (thorough) $("status").textContent = "Opening every recording …";
+  if (thorough) [comparing, $("status").textContent] = [mine, "Opening every recording …"];
   try {
     const found = await ask("api/check", content({thorough}));
     if (mine !== turn) return;
+    comparing = -1;
     state.problems = found.problems;
     if (thorough) state.compared = true;
     for (const [name, text] of Object.entries(found.texts)) {
@@ -64,7 +63,7 @@ async function save() {
     state.stamp = made.stamp;
     state.dirty = false;
     // Results of the comparison with the recordings remain valid: saving changes nothing that was compared.
-    if (state.compared) showState();
+    if (state.compared || turn === comparing) showState();
     else await check();
     $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "No changes"} · ${$("status").textContent}`;
   } catch (error) {

@@ -46,7 +46,10 @@ function sharedRow(columns) {
     if (!known?.shared) return el("td");
     const key = sharedKey(name) ?? name;
     const blank = known.default.startsWith("required") ? "" : known.default.split(":")[0].slice(0, 12);
-    return cell(name, "shared", state.shared[key] ?? "", blank, (value) => { state.shared[key] = value; placeholders(name); });
+    return cell(name, "shared", state.shared[key] ?? "", blank, (value) => {
+      state.shared[key] = value;
+      for (const field of $("trials").querySelectorAll(`tbody tr:not(.all) input[data-column="${name}"]`)) field.placeholder = value;
+    });
   });
   return el("tr", {class: "all"}, el("td", {class: "pic"}), el("td", {class: "label"}, "All trials"), ...cells);
 }
@@ -81,10 +84,6 @@ function cell(column, row, value, placeholder, write) {
     ? el("select", {...given, onchange: heard}, ...["", "yes", "no"].map((word) => el("option", {value: word, selected: word === value}, word)))
     : el("input", {...given, type: "text", value, placeholder, spellcheck: "false", autocomplete: "off", list: column === "pressure_trace" ? "traces" : null, inputmode: known?.kind === "number" ? "decimal" : "text", oninput: heard});
   return el("td", {class: known?.kind === "number" ? "" : "text"}, field);
-}
-
-function placeholders(name) {
-  for (const field of $("trials").querySelectorAll(`tbody tr:not(.all) input[data-column="${name}"]`)) field.placeholder = sharedValue(name);
 }
 
 function move(event) {
@@ -138,11 +137,7 @@ async function propose(block, column, row) {
 
 $("leave").onclick = () => { $("preview").hidden = true; $("pasted").replaceChildren(); };
 
-function refreshAt(column, row) {
-  changed();
-  drawTable();
-  $("trials").querySelector(`[data-column="${column}"][data-row="${row}"]`)?.focus();
-}
+const refreshAt = (column, row) => { changed(); drawTable(); $("trials").querySelector(`[data-column="${column}"][data-row="${row}"]`)?.focus(); };
 
 addEventListener("input", () => { before = null; });
 addEventListener("keydown", (event) => {
@@ -151,8 +146,7 @@ addEventListener("keydown", (event) => {
   Object.assign(state, before);
   before = null;
   $("pasted").replaceChildren();
-  const {column, row} = document.activeElement?.dataset ?? {};
-  refreshAt(column, row);
+  refreshAt(document.activeElement?.dataset.column, document.activeElement?.dataset.row);
 });
 
 function drawAdder(columns) {
