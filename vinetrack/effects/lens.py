@@ -21,7 +21,16 @@ from vinetrack.effects import Parameter, Worked
 KIND = "measurement"
 ORDER = 4
 PARAMETERS = (
-    Parameter("k3", "k₃", "1/m²", 0.3, bounds=(-50.0, 50.0), plausible=(-1.0, 1.0), meaning="radial distortion"),
+    Parameter(
+        "k3",
+        "k₃",
+        "1/m²",
+        0.3,
+        bounds=(-50.0, 50.0),
+        shared="day",
+        plausible=(-1.0, 1.0),
+        meaning="radial distortion",
+    ),
     Parameter(
         "y_c",
         "y_c",

@@ -20,7 +20,16 @@ from vinetrack.effects import Parameter, Worked
 KIND = "measurement"
 ORDER = 4
 PARAMETERS = (
-    Parameter("k", "k", "1/m", 0.05, bounds=(-3.0, 3.0), plausible=(-0.3, 0.3), meaning="change of scale along y"),
+    Parameter(
+        "k",
+        "k",
+        "1/m",
+        0.05,
+        bounds=(-3.0, 3.0),
+        shared="day",
+        plausible=(-0.3, 0.3),
+        meaning="change of scale along y",
+    ),
 )
 
 
