@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (693, 4, 5),
     "core": (956, 7, 26),
-    "diagnosis": (6524, 16, 93),
+    "diagnosis": (6066, 14, 90),
     "dynamics": (2318, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
@@ -36,7 +36,7 @@ BUDGETS = {
     "interface": (599, 2, 2),
     "kinematics": (1714, 6, 12),
     "laboratory": (1600, 6, 9),
-    "narrative": (1113, 3, 9),
+    "narrative": (1070, 3, 9),
     "pages": (2874, 8, 22),
     "paper": (891, 4, 35),
     "pipeline": (1999, 7, 6),

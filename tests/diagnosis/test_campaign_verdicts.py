@@ -27,6 +27,7 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
 from vinetrack.diagnosis.diagnose import not_better, with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
+from vinetrack.diagnosis.ladder import align_trials
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
@@ -464,6 +465,7 @@ def test_the_drag_of_falling_balls_is_named(model):
     drag = found.fits[-1]["C_D"]
     assert drag.low < DRAG < drag.high
     assert drag.sigma < 0.03 * DRAG
+    assert align_trials(found.fits[0]).scatter.multiple == 1.0  # no pressure or B of theirs can scatter
     untried = {row.effect for row in found.rounds[0].ranking if row.status == "not testable here"}
     assert untried >= TUBES_ALONE
 

@@ -197,14 +197,16 @@ class AlignedTrials:
 
     @cached_property
     def scatter(self) -> Scatter:
-        """The multiple of the typical scatter at which an adequate model would be off by the replicate floor."""
+        """The multiple of the typical scatter at which an adequate model would be off by the replicate floor; 1 where
+        no pressure or B moves the trials.
+        """
         together, beyond, typical, dof = replicates_by_condition(self.trials), 0.0, 0.0, 0
         for condition, members in self.courses.items():
             if not math.isnan(floor_m := together[condition].floor_m):
                 beyond += sum(floor_m**2 - member.position_m2 for member in members)
                 typical += sum(float(np.trace(member.typical_m2)) for member in members)
                 dof += len(members) - 1
-        return Scatter(math.sqrt(max(beyond, 0.0) / max(typical, 1e-300)), dof) if dof else Scatter(1.0, 0)
+        return Scatter(math.sqrt(max(beyond, 0.0) / typical) if typical > 0 else 1.0, dof)
 
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""

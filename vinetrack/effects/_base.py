@@ -138,10 +138,11 @@ class Parameter:
 
     `zero` is the value at which the effect vanishes. `shared` says which trials have one value: `all`, those of one
     `vine`, or of one `day` where the sheet states it for every trial, else of one vine: a camera is set up anew for
-    either. `bounds` are the physical limits, `plausible` the range that an experimenter would expect. A `held` parameter is known and fixed unless it is freed by name. For a
-    shape parameter, `tried` are the values at which a diagnosis tests the effect; by default two or three of the
-    plausible range. Values a `period` apart are equivalent. `slips` are sizes of a relative error that a common slip in
-    the sheet causes, each with a description; such a size is plausible however large it is.
+    either. `bounds` are the physical limits, `plausible` the range that an experimenter would expect. A `held`
+    parameter is known and fixed unless it is freed by name. For a shape parameter, `tried` are the values at which a
+    diagnosis tests the effect; by default two or three of the plausible range. Values a `period` apart are equivalent.
+    `slips` are sizes of a relative error that a common slip in the sheet causes, each with a description; such a size
+    is plausible however large it is.
     """
 
     __pydantic_config__ = ConfigDict(revalidate_instances="always")
