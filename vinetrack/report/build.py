@@ -186,9 +186,10 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
     if limits:
         sizes = [(*row[:2], limits.get(row[:2], "–"), *row[2:]) for row in sizes]
+    badge = diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed"
     return {
-        "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
-        "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
+        "badge": "check the sheet" if diagnosis.contradicted_columns else badge,
+        "kind": badge if badge in VERDICTS and not diagnosis.contradicted_columns else "none",
         "sentence": verdict_sentence(diagnosis),
         "summaries": [effects[name].summary for name in named if name in effects],
         "table": verdict_table(diagnosis),
