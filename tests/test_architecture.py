@@ -37,7 +37,7 @@ BUDGETS = {
     "kinematics": (1714, 6, 12),
     "laboratory": (1600, 6, 9),
     "narrative": (1113, 3, 9),
-    "pages": (2874, 8, 22),
+    "pages": (2870, 8, 22),
     "paper": (891, 4, 35),
     "pipeline": (1999, 7, 6),
     "planning": (1586, 5, 24),
