@@ -90,7 +90,7 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     any_colour = re.compile("|".join(colours))
 
     def short(tag: re.Match[str]) -> str:
-        text = re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0])
+        text = re.sub(r"\.0+(?= )", "", re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0]))
         text = text if " C " in text else text.replace(" L ", " ")  # places after a move are lines to them
         return any_colour.sub(lambda match: colours[match[0]], text)
 
@@ -102,8 +102,8 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     body = re.sub(r'(url\(|href=")#([^")]+)', lambda match: f"{match[1]}#{own[match[2]]}", body)
     body = re.sub(r'font-family: [^;"]*;? ?| transform="rotate\(-0 [^"]*"', "", body)
     # WebP quality of the images in a strip, 0 to 100
-    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
-    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body))
+    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 30), body)
+    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body)).replace("xlink:href", "href")
     label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
     return f"<svg {head}>{body}</svg>"
