@@ -202,8 +202,9 @@ def test_marks_of_a_ruler_are_found_to_a_thousandth(given):
     assert abs(found["uneven"]) == pytest.approx(2 * askew * given["length_mm"], abs=6e-3)
 
 
-def test_texture_is_no_ruler():
+def test_texture_and_nothing_at_all_are_no_ruler():
     rng = np.random.default_rng(11)
+    assert [ruler_in(np.full(size, 7, np.uint8)) for size in ((60, 90), (5, 9))] == [None, None]
     for grain_px in (0.5, 1.5, 4.0):
         texture = cv2.GaussianBlur(rng.normal(size=(300, 500)).astype(np.float32), (0, 0), grain_px)
         assert ruler_in(np.clip(128 + 40 * texture / texture.std(), 0, 255).astype(np.uint8)) is None

@@ -182,6 +182,8 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
     html = shown(diagnosis(verdict))
     assert heading(html).startswith(f"{verdict} ")
     assert f'class="badge badge-{verdict}"' in html
+    doubted = page(diagnosis=replace(read(diagnosis(verdict)), contradicted_columns=("pressure_kPa",)))
+    assert '<span class="badge badge-none">check the sheet</span>' in doubted
     tags = Tags(html)
     assert (tags.wrong, tags.open) == ([], [])
     attributes = [attributes for _, attributes in tags.tags]

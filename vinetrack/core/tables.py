@@ -114,7 +114,7 @@ def parse_number(text: str, decimal: str = ".") -> float:
     if text == "":
         raise InputError("is blank", "write a number", code="blank")
     if not _NUMBER.fullmatch(text):
-        raise InputError("is not a number", "write digits only, without unit or separators", code="not_a_number")
+        raise InputError("is not a number", "write digits only, without separators", code="not_a_number")
     if _AMBIGUOUS_NUMBER.fullmatch(text) and ("," if "," in text else ".") != decimal:
         remedy = f"write {text.replace(',', '.')}0 or {re.sub('[.,]', '', text)}, whichever is meant"
         raise InputError("may be thousands or decimals", remedy, code="ambiguous_number")

@@ -195,13 +195,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"did you mean {nearest[0]}?"
 
 
-_WITH_UNIT = re.compile(r"([-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?)\s*([^\W\d_].*)")
-
-
 def value_and_unit(cell: str, name: str) -> tuple[str, str]:
     """Split `150 um` into its number and the key of its unit, one of a column's quantity; blank where it has none."""
-    own = split_unit(name)[1]
-    if not (own and (found := _WITH_UNIT.fullmatch(cell))):
+    own, form = split_unit(name)[1], r"([-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?)\s*([^\W\d_].*)"
+    if not (own and (found := re.fullmatch(form, cell))):
         return cell, ""
     word = found[2].replace("μ", "µ").lower()
     for key, unit in UNITS.items():

@@ -189,7 +189,7 @@ def ruler_in(picture: NDArray[Any]) -> dict[str, Any] | None:
         back = cv2.invertAffineTransform(turn)
         lines.append((float(power[row, k]), back @ [side / 2, 2 * row + 1, 1] / small, back[:, 0], k / side * small))
     lines = sorted(lines, key=lambda line: -line[0])[:12]  # 12: lines looked at (chosen)
-    found = [ruler for line in lines if (ruler := _marks_along(grey, *line[1:])) is not None]
+    found = [ruler for line in lines if line[0] > 0 and (ruler := _marks_along(grey, *line[1:]))]
     return max(found, key=lambda ruler: ruler["spacings"], default=None)
 
 
@@ -205,7 +205,7 @@ def _marks_along(grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], rat
         rate = (near.start + int(np.argmax(np.abs(np.fft.rfft(level)[near])))) / u.size
         # What is strongest may be a multiple of the marks' own rate.
         strength = {n: abs(np.exp(-2j * np.pi * rate / n * u) @ level) for n in (3, 2, 1)}
-        rate /= next(n for n in strength if strength[n] > 0.3 * strength[1])
+        rate /= next(n for n in strength if strength[n] >= 0.3 * strength[1])
         if u.size * rate < FEWEST_SPACINGS:
             return None
         window = np.hanning(round(4 / rate) | 1)

@@ -90,7 +90,7 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     any_colour = re.compile("|".join(colours))
 
     def short(tag: re.Match[str]) -> str:
-        text = re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0])
+        text = re.sub(r"\.0+(?= )", "", re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0]))
         text = text if " C " in text else text.replace(" L ", " ")  # places after a move are lines to them
         return any_colour.sub(lambda match: colours[match[0]], text)
 
@@ -102,8 +102,8 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     body = re.sub(r'(url\(|href=")#([^")]+)', lambda match: f"{match[1]}#{own[match[2]]}", body)
     body = re.sub(r'font-family: [^;"]*;? ?| transform="rotate\(-0 [^"]*"', "", body)
     # WebP quality of the images in a strip, 0 to 100
-    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
-    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body))
+    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 30), body)
+    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body)).replace("xlink:href", "href")
     label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
     return f"<svg {head}>{body}</svg>"
@@ -186,9 +186,10 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
     if limits:
         sizes = [(*row[:2], limits.get(row[:2], "–"), *row[2:]) for row in sizes]
+    badge = diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed"
     return {
-        "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
-        "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
+        "badge": "check the sheet" if diagnosis.contradicted_columns else badge,
+        "kind": badge if badge in VERDICTS and not diagnosis.contradicted_columns else "none",
         "sentence": verdict_sentence(diagnosis),
         "summaries": [effects[name].summary for name in named if name in effects],
         "table": verdict_table(diagnosis),

@@ -377,7 +377,12 @@ export function drawProblems() {
 $("frame").oninput = (event) => showFrame(Number(event.target.value));
 $("source").onchange = (event) => showPicture(event.target.value);
 $("tools").oninput = () => (chosen("tool") === "scale" && !state.calibration && !marks.from_px && state.pictures.length ? showPicture(state.pictures[0]) : redraw());
-$("turned").onclick = ({target}) => { if (target.value) { state.shared.growth_angle_deg = target.value; changed(); drawTable(); redraw(); } };
+$("turned").onclick = ({target}) => {
+  if (!target.value) return;
+  state.shared.growth_angle_deg = target.value;
+  [changed, drawTable, redraw].forEach((next) => next());
+  $("trials").querySelector("[data-column=growth_angle_deg]").focus();
+};
 $("axis-scope").onchange = (event) => { if (currentAxis()?.given) setAxis(currentAxis(), event.target.value); };
 $("square").oninput = $("spacing").oninput = suggest; // before the scale is written
 $("scale-tool").oninput = writeScale;

@@ -89,9 +89,7 @@ async function begin() {
   document.body.dataset.ready = "yes";
 }
 
-for (const kind of ["click", "focusin"]) {
-  $("trials").addEventListener(kind, ({target}) => { const line = target.closest("tr[data-row]"); if (line) choose(Number(line.dataset.row)); });
-}
+for (const kind of ["click", "focusin"]) $("trials").addEventListener(kind, ({target}) => { const line = target.closest("tr[data-row]"); if (line) choose(Number(line.dataset.row)); });
 $("save").onclick = save;
 $("check").onclick = () => check(true);
 $("track").onclick = () => track();
