@@ -255,7 +255,7 @@ def votes(
 # Brightness of film and background at every pixel: weighted means over the frames in which it is wholly the one or the
 # other. A pixel that the edge is passing tells of neither.
 
-MEMORY_CUTOFF = 3.0  # Frames further away than this many memories are not read; their weight is e⁻³ = 5 % (chosen)
+MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 % (chosen)
 ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
 
 
