@@ -119,8 +119,8 @@ def blank(message: str) -> Figure:
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
     """Return the figure in each format, reproducible to the byte; PNG on white, the others transparent."""
     details: dict[str, dict[str, Any]] = {
-        # zlib's level 3 instead of 6 packs a figure in two thirds of the time, in 15 % more room
-        "png": {"facecolor": "white", "metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}},
+        # zlib's level 1 instead of 6 packs a figure in a third of the time, in a quarter more room
+        "png": {"facecolor": "white", "metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}},
         "svg": {"metadata": {"Date": None, "Creator": None}},
         "pdf": {"metadata": {"CreationDate": None}},
     }

@@ -17,68 +17,69 @@ from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
 from vinetrack.video.point_quality import calibrated_sigma
-from vinetrack.video.strip import SLOW_PX, Look, Positions, cut_strip
+from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
-
-
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
 
 
-def follow_body(look: Look) -> Positions | None:
-    """Register what moves along an axis against itself; None where the travel ratio says that a tube everts."""
-    if look.travel_ratio != 1:
-        return None
-    strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
-    pictures = strip.brightness()
-    path, half = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
-    if np.isfinite(strip.axis.width_px):
-        # A body is about as long as it is wide; a glint on it is shorter.
-        half = max(half, round(0.75 * strip.axis.width_px))
-    if np.ptp(path) < 3:
-        raise RecordingError("nothing moves along the axis")
-    # Cut near the middle of the frames in which the whole body is inside and moving
-    whole = np.flatnonzero((path > 1.3 * half) & (path < pictures.shape[2] - 1 - 1.3 * half))
-    moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
-    chosen = moving or whole.tolist() or [*range(len(path))]
-    template_frame = int(chosen[len(chosen) // 2])
-    template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
-    body_rows = _row_weights(template.shape[0], strip.axis.width_px)
-    weight = np.ones_like(template) * body_rows
-    place = np.column_stack([path, np.zeros(len(path))])
-    # 3: times that the template is replaced by the median of the patches found (chosen)
-    for turn in range(3 + 1):
-        place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
-        if turn < 3:
-            template, weight = _median_template(pictures, place, match, half, strip.noise)
-            weight = weight * body_rows
-    inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
-    off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
-    # 0.4: correlation below which the patch found is not the body (chosen)
-    unseen = (match < 0.4) | off_axis
-    recognised, end = np.flatnonzero(~unseen & (match >= POOR_MATCH)), None
-    if len(recognised) >= 3:
-        # 3.0, 6.0: distance behind its furthest place at which a body has turned back, in px and in standard errors
-        # (chosen)
-        back_px = np.maximum(3.0, 6.0 * np.nan_to_num(error[recognised], nan=0.0))
-        turned = turning_point(place[recognised, 0], back_px)
-        last = int(recognised[-1 if turned is None else turned])
-        unseen |= np.arange(len(unseen)) > last
-        end = None if turned is None else last
-    found = np.flatnonzero(~unseen)
-    # 0.5: part of the frames, from the first to the last in which it is seen, that must show a body (chosen)
-    hardly_seen = len(found) > 0 and len(found) < 0.5 * (1 + np.ptp(found))
-    if hardly_seen or hops_between_bodies(place[:, 0], ~unseen):
-        raise RecordingError(
-            "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
-        )
-    edge = np.where(unseen, np.nan, place[:, 0])
-    # 20.0: largest factor on an error whose likelihood does not know the interpolation between pixels (measured)
-    return Positions(
-        strip=strip, edge_px=edge, sigma_px=calibrated_sigma(edge, error, 20.0),
-        unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
-        exposure_frames=look.exposure_frames,
-    )  # fmt: skip
+class BodyTracker(Tracker):
+    """Registers what moves along an axis against itself; None where the travel ratio says that a tube everts."""
+
+    def follow(self, look: Look) -> Positions | None:
+        """See `Tracker`."""
+        if look.travel_ratio != 1:
+            return None
+        strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
+        pictures = strip.brightness()
+        path, half = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
+        if np.isfinite(strip.axis.width_px):
+            # A body is about as long as it is wide; a glint on it is shorter.
+            half = max(half, round(0.75 * strip.axis.width_px))
+        if np.ptp(path) < 3:
+            raise RecordingError("nothing moves along the axis")
+        # Cut near the middle of the frames in which the whole body is inside and moving
+        whole = np.flatnonzero((path > 1.3 * half) & (path < pictures.shape[2] - 1 - 1.3 * half))
+        moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
+        chosen = moving or whole.tolist() or [*range(len(path))]
+        template_frame = int(chosen[len(chosen) // 2])
+        template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
+        body_rows = _row_weights(template.shape[0], strip.axis.width_px)
+        weight = np.ones_like(template) * body_rows
+        place = np.column_stack([path, np.zeros(len(path))])
+        # 3: times that the template is replaced by the median of the patches found (chosen)
+        for turn in range(3 + 1):
+            place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
+            if turn < 3:
+                template, weight = _median_template(pictures, place, match, half, strip.noise)
+                weight = weight * body_rows
+        inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
+        off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
+        # 0.4: correlation below which the patch found is not the body (chosen)
+        unseen = (match < 0.4) | off_axis
+        recognised, end = np.flatnonzero(~unseen & (match >= POOR_MATCH)), None
+        if len(recognised) >= 3:
+            # 3.0, 6.0: distance behind its furthest place where a body has turned back, px and standard errors (chosen)
+            back_px = np.maximum(3.0, 6.0 * np.nan_to_num(error[recognised], nan=0.0))
+            turned = turning_point(place[recognised, 0], back_px)
+            last = int(recognised[-1 if turned is None else turned])
+            unseen |= np.arange(len(unseen)) > last
+            end = None if turned is None else last
+        found = np.flatnonzero(~unseen)
+        # 0.5: part of the frames, from the first to the last in which it is seen, that must show a body (chosen)
+        hardly_seen = len(found) > 0 and len(found) < 0.5 * (1 + np.ptp(found))
+        if hardly_seen or hops_between_bodies(place[:, 0], ~unseen):
+            raise RecordingError(
+                "what is followed hops between several bodies that move along the axis: give the axis, with a smaller "
+                "width"
+            )
+        edge = np.where(unseen, np.nan, place[:, 0])
+        # 20.0: largest factor on an error whose likelihood does not know the interpolation between pixels (measured)
+        return Positions(
+            strip=strip, edge_px=edge, sigma_px=calibrated_sigma(edge, error, 20.0),
+            unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
+            exposure_frames=look.exposure_frames,
+        )  # fmt: skip
 
 
 def hops_between_bodies(along: Floats, seen: Bools) -> bool:

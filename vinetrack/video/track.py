@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis
-from vinetrack.video.body import follow_body
+from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import axis_problem, find_growth_axis
-from vinetrack.video.edge import follow_edge
+from vinetrack.video.edge import EdgeTracker
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
@@ -29,51 +29,52 @@ from vinetrack.video.point_quality import (
     ending_of,
 )
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.strip import Look, Positions, cut_strip
+from vinetrack.video.strip import Look, Positions, Tracker, cut_strip
 
 # ------------------------------------------------------------------------------
 # Follow what moves along an axis, by frame: a body, the edge of a tube, or else the arrival of whatever comes.
 
 
-def follow_arrival(look: Look) -> Positions:
-    """Follow the tip of a vine that bends, sweeps or slides along walls, to about a pixel, as the column up to which
-    the scene has changed. Its film does not stay in place, so that a tracker of a straight front would follow the
-    sweep.
+class ArrivalTracker(Tracker):
+    """Follows the tip of a vine that bends, sweeps or slides along walls, to about a pixel, as the column up to which
+    the scene has changed: its film does not stay in place, so that another tracker would follow the sweep.
     """
-    width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
-    strip = cut_strip(look.luma, look.axis, width_px)
-    min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
-    values = strip.brightness()
-    first = np.median(values[:END_FRAMES], axis=0)
-    # 4.0: change, in units of the noise, that counts (chosen)
-    threshold = 4.0 * max(strip.noise, 3.0)
-    changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
-    smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
-    evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
-    ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
-    if len(ever) < 10:
-        raise ValueError("nothing moves along the axis")
-    evidence[:, : ever[0]] = 0.0
-    path = dividing_path(evidence)
-    edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
-    smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    # 0.8, 1.0: random error before it is scaled to the roughness, and slow error, of an arrival (measured)
-    return Positions(
-        strip=strip, edge_px=smoothed, sigma_px=calibrated_sigma(smoothed, np.full(len(edge), 0.8)),
-        unsure=np.zeros(len(edge), dtype=bool), reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames,
-        is_edge=False,
-    )  # fmt: skip
+
+    def follow(self, look: Look) -> Positions:
+        """See `Tracker`."""
+        width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
+        strip = cut_strip(look.luma, look.axis, width_px)
+        min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
+        values = strip.brightness()
+        first = np.median(values[:END_FRAMES], axis=0)
+        # 4.0: change, in units of the noise, that counts (chosen)
+        threshold = 4.0 * max(strip.noise, 3.0)
+        changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
+        smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
+        evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
+        ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
+        if len(ever) < 10:
+            raise ValueError("nothing moves along the axis")
+        evidence[:, : ever[0]] = 0.0
+        path = dividing_path(evidence)
+        edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
+        smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+        # 0.8, 1.0: random error before it is scaled to the roughness, and slow error, of an arrival (measured)
+        return Positions(
+            strip=strip, edge_px=smoothed, sigma_px=calibrated_sigma(smoothed, np.full(len(edge), 0.8)),
+            unsure=np.zeros(len(edge), dtype=bool), reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames,
+            is_edge=False,
+        )  # fmt: skip
 
 
-# Asked in turn: the first that knows what moves follows it; the others return None. Another tracker is a function in a
-# file of its own and a name here.
-TRACKERS: tuple[Callable[[Look], Positions | None], ...] = (follow_body, follow_edge, follow_arrival)
+# Asked in turn: the first that knows what moves follows it; the others return None.
+TRACKERS: list[Tracker] = [BodyTracker(), EdgeTracker(), ArrivalTracker()]
 
 
 def follow(look: Look) -> Positions:
     """Follow what moves along an axis by the first tracker that knows it."""
     try:
-        return next(found for tracker in TRACKERS if (found := tracker(look)) is not None)
+        return next(found for tracker in TRACKERS if (found := tracker.follow(look)) is not None)
     except RecordingError:
         raise
     except ValueError as error:
@@ -135,7 +136,7 @@ class Tracking:
 
     track: Track
     axis: Axis
-    kymograph: NDArray[np.float32]
+    kymograph: NDArray[np.uint8]
     strip_rows: Indices
     pictures: tuple[tuple[int, NDArray[Any]], ...]
     exposure_frames: float
@@ -199,11 +200,12 @@ def track_pixels(
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
-    kymograph = strip.values.mean(axis=1, dtype=np.float32) * strip.scale[:, None] + strip.offset[:, None]
+    mean = strip.values.mean(axis=1, dtype=np.float32) * strip.scale[:, None] + strip.offset[:, None]
+    kymograph = np.clip(np.rint(mean), 0, 255).astype(np.uint8)
     shake_px = np.zeros(len(frames.slots))
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
-        track, strip.axis, kymograph.astype(np.float32), number, pictures, followed.exposure_frames, shake_px,
+        track, strip.axis, kymograph, number, pictures, followed.exposure_frames, shake_px,
         followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame, ending,
     )  # fmt: skip
 
