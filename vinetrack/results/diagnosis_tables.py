@@ -125,7 +125,8 @@ def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
-    for k, row in enumerate(former.itertuples() if len(ladder) else ()):
-        if row.model == ladder["model"][0] and np.isclose(row.rms_in_sample_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
+    known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
+    for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
+        if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
             return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
     return ladder
