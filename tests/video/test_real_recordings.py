@@ -66,7 +66,7 @@ def test_a_cup_among_others_is_followed_until_it_leaves_the_picture(real, number
     track = cup(real, number, 10.0)
     assert not track.usable[len(measured) :].any()
     used = np.flatnonzero(track.usable)
-    assert len(used) >= 7
+    assert len(used) >= 6  # of cup 8, 6 px wide, in 9 frames: 6 or 7, as a processor rounds
     off = track.edge_px[used] - measured[used]
     assert np.abs(off - np.median(off)).max() < 1.5
 
