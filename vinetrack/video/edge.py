@@ -25,7 +25,6 @@ from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     EARLY_FIT_ROUNDS,
     FIT_ROUNDS,
-    MARGIN_PX,
     START_CLEARANCE_PX,
     EdgeState,
     blur_lengths,
@@ -37,7 +36,6 @@ from vinetrack.video.edge_state import (
     fit_edges,
     informative_frames,
     moving_frames,
-    residual_sums,
     search_edges,
     seen_exposure,
 )
@@ -49,9 +47,11 @@ from vinetrack.video.strip import Look, Positions, Strip, Tracker, cut_strip, sn
 # ------------------------------------------------------------------------------
 # Repair of edge fits that break the motion, and errors of the edge.
 #
-# Where the fit of a frame breaks the motion, the edge is searched again where that leads. Its error is that of what its
-# bands of rows would move it by, each alone: film, tail, glints and a door touch one band and not another. What of it
-# differs from frame to frame is told by the roughness of the track; the rest is slow.
+# The fit of every frame is compared with the motion; where it breaks it, the edge is searched again where the motion
+# leads. Its error is that of what its bands of rows would move it by, each alone: this needs no model of noise, since
+# film, tail, glints and a swinging door touch one band and not another. The roughness of the track tells which part of
+# it differs from frame to frame; the rest is slow. Near the start a door or a mouth may hide the tip as well.
+
 
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
@@ -59,8 +59,9 @@ LEAST_FITTED_AMPLITUDE = 0.5
 
 
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> Floats:
-    """Replace fits that break the motion or hardly fit by the best ones where it leads, from its middle either way. The
-    edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px more.
+    """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
+    the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
+    more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
     """
     # Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
     long_rest_frames = 8
@@ -75,7 +76,6 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
     rough[1:-1] = np.abs(at[1:-1] - 0.5 * (at[2:] + at[:-2])) > 1.0 + 0.15 * np.abs(at[2:] - at[:-2]) / 2
     anchor = int(moving[np.argmin(decentrality + rough + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
-    clear_px = clear_of_start(state.edge)
     edge = out[:, 0].tolist()
     for sense in (-1, 1):
         resting = 0
@@ -90,46 +90,36 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
             good_enough = (out[t, 2] <= bad_misfit or resting > long_rest_frames) and not faint
             if not math.isfinite(previous) or (inside and good_enough):
                 continue
-            starts = 1 if resting > long_rest_frames else 9
-            replacement = _best_between(strip, state, t, low, high, starts, edge[t] if inside else math.nan)
+            replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
             ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
-                # Away from the start, where a door hides pixels, a likelier fit must also leave less.
-                if replacement is not None and (faint or low <= clear_px or replacement[2] < out[t, 2]):
+                if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
             elif not faint and is_better and step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25:
                 continue  # two to four whole steps: frames are missing, and the point is right
             elif replacement is None:
                 expected = previous if math.isnan(edge[t]) else edge[t]
-                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0)
+                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0, 0)
             else:
                 out[t] = replacement
             edge[t] = float(out[t, 0])
     return out
 
 
-def _best_between(
-    strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int, here: float
-) -> Floats | None:
-    """Best fit of frame t that starts and stays between `low` and `high`, one starting `here` if that is a number;
-    shape (4,), None where there is none. The likelihood over the same pixels decides: a misfit is small wherever little
-    is known of the pixels.
-    """
-    places = np.append(np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts], here)
+def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
+    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
+    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
     fits = search_edges(strip, state, np.full(len(places), t), places)
     inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
-    fits = fits[inside & np.isfinite(fits[:, 2])]
-    if not len(fits):
-        return None
-    span = max(round(fits[:, 0].min() - state.lag.max() - MARGIN_PX), 0), round(fits[:, 0].max() + MARGIN_PX)
-    misfit = residual_sums(strip, state, fits, np.full(len(fits), t), span[1] - span[0], span)[2]
-    return fits[np.argmin(misfit[:, 2])]
+    inside &= np.isfinite(fits[:, 2])
+    return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
 
 
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
-    """Standard error of an edge that stops or starts within an exposure of τ frames or next to it: the model's blur is
-    that of the mean of the speeds before and after, and uncertain by τΔv/2 where these differ by Δv.
+    """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
+    uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
+    the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. Shapes: edge (n_frames,) → (n_frames,).
     """
     if len(edge) < 3 or exposure_frames <= 0:
         return np.zeros(len(edge))
@@ -145,9 +135,10 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # ------------------------------------------------------------------------------
 # Detect what hides the tip at the start: a door that stands or swings in front of it, or the mouth of a launcher.
 #
-# A door leaves; while it hides the tip, the picture resembles neither film nor background, and the misfit shows it. A
-# mouth stays: its straight border looks like a tip at rest while the tip moves behind it, and stays where the edge
-# rested, whereas behind a tip that was seen at rest the film continues without a border.
+# A door leaves. While it hides the tip, the picture resembles neither film nor background, and the misfit shows it. A
+# mouth stays: its border with the background looks like a tip at rest while the tip moves behind it. What the tip
+# leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
+# tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
 # Misfit, in units of the noise, above which an object stands in front of the tip (chosen)
 HIDDEN_MISFIT = 3.6
@@ -216,7 +207,7 @@ def _near_start(edge: Floats) -> Bools:
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
     picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
-    4); misfit_ratio, edge (n_frames,) → (n_frames,).
+    6); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 1.6, 0.75: misfit above which, and amplitude below which, part of the edge is hidden (chosen)
@@ -235,13 +226,14 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 # Path of the front through a strip: the monotone path that best divides pixels that look like film from pixels that
 # look like background.
 #
-# The first path takes the last frames for film and the first for background: an object that stood in front at the start
-# misleads it, and it starts and ends up to three frames off, because several frames are averaged at either end.
+# The first path knows neither, and takes the last frames for film and the first for background. An object that stood in
+# front at the start misleads it, and it starts up to three frames late and ends up to three frames early, because
+# several frames are averaged at either end.
 
 
 def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
-    """Find the initial path of the front, with film and background for a straight tip and a typical blur; and the first
-    column that it leaves changed for good, and the one behind the last.
+    """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
+    film and background for a straight tip and a typical blur; and first column passed, and the one behind the last.
     """
     ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
     last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
@@ -250,9 +242,12 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     group_size = int(np.clip(len(first) // 12, 1, 4))
     grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
     power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
+    # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
-    votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, 4.0 * strip.noise)
-    path, passed = _trim_to_changed_runs(ky.dividing_path(votes), power)
+    weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
+    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
+    votes = [((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks]
+    path, passed = _trim_to_changed_runs(ky.dividing_path(np.stack(votes)), power)
     blank = np.zeros((4, *first.shape), np.float32)
     state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, blank)
     return estimate_appearance(strip, state, 0.0), passed
@@ -273,8 +268,9 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    # A run-up: the beginning is replaced by steps that decrease going back in time, as from rest. A door may have stood
-    # where growth is first visible, and the tip may have come from further back; else the second path corrects this.
+    # A run-up: the beginning is replaced by steps that decrease going back in time, as from rest. An object such as a
+    # door may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
+    # columns in between turn out to be film from the start, and the second path corrects this.
     path = np.clip(path, *passed)
     steps = np.diff(path)
     onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
@@ -313,8 +309,10 @@ class EdgeTracker(Tracker):
         for iteration in range(3 * rounds):
             before = fit[:, 0]
             # Take over the fitted edges, and hold them at rest; blur lengths, film and background follow from them.
-            edge = np.where(np.isfinite(before), before, state.edge)
-            fitted = np.flatnonzero(informative_frames(state.edge))
+            edge, fitted = (
+                np.where(np.isfinite(before), before, state.edge),
+                np.flatnonzero(informative_frames(state.edge)),
+            )
             edge = edge[np.clip(np.arange(len(edge)), fitted[0], fitted[-1])]
             state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
             state = estimate_appearance(strip, state, 4 * strip.noise + 4)
@@ -327,11 +325,15 @@ class EdgeTracker(Tracker):
             steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
             fit = repair_jumps(strip, state, fit_edges(strip, state, informative, steps), informative)
             # 0.2: the iteration has converged once no edge of a moving frame changes by more than this (chosen)
-            moved = np.abs(fit[:, 0] - before)[moving_frames(state.edge)]
-            if iteration >= rounds - 1 and float(np.nanmax(moved)) < 0.2:
+            if (
+                iteration >= rounds - 1
+                and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < 0.2
+            ):
                 break
-        fit = np.where(informative[:, None], fit, fit_edges(strip, state, ~informative))
-        fit = repair_jumps(strip, state, fit, np.ones(len(fit), dtype=bool))
+        resting_fit = fit_edges(strip, state, ~informative)
+        fit = repair_jumps(
+            strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool)
+        )
         finished = _with_errors(strip, state, fit, exposure, tube)
         if not np.isfinite(exposure_frames):
             return finished
@@ -357,8 +359,9 @@ class Outline:
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
-    """Measure the centreline and width of the tube that the front leaves behind, by the contrast of each row between
-    film and background, in `parts` stretches along the axis: this corrects a given one that is two degrees off.
+    """Measure the centreline and width of the tube that the front leaves behind. The contrast of each row between film
+    and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
+    degrees off and would cut the tube obliquely.
     """
     state, passed = initial_front_path(strip)
     film, background = state.appearance[:2, :, passed[0] : passed[1]]
@@ -411,12 +414,13 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
 
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
 # Largest distance from the tube's middle at which a line, which lies on whole rows, and a curve are left (measured)
-CENTRED_LINE_PX, CENTRED_CURVE_PX = 1.5, 0.3
+CENTRED_LINE_PX, CENTRED_CURVE_PX = 0.8, 0.3
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
-    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too;
-    None where no single front passes along the axis, or along the middle of what it leaves.
+    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
+    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
+    passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
     """
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
@@ -441,8 +445,9 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
 
 
 def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
-    """Move an axis across onto the middle of a tube, with the tube's width, and measure how far that lies from it. A
-    curve stays as it is where the tube's middle makes none that a strip can be cut along.
+    """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
+    keep their places along it: only the position across is corrected. A curve stays as it is where the tube's middle
+    makes none that a strip can be cut along.
     """
     if not axis.bends:
         ends_px = np.array([0.0, axis.length_px])
@@ -472,7 +477,8 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
 
 def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: float, passed: tuple[int, int]) -> Floats:
     """Find the monotone path that best divides film from background between the columns that it passes. Distances from
-    either are clipped, so that a door, a payload flying ahead or a reflection cannot capture it.
+    either, in standard deviations of a pixel and of `width` together, are clipped, so that a door, a payload flying
+    ahead or a reflection cannot capture it.
     """
     # 2.5: standard deviations at which the difference of a pixel from film or background is clipped (chosen)
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width, 2.5)

@@ -122,13 +122,13 @@ def fit_edges(
     blur: float, appearance: np.ndarray, prior_sd: float, margin: float, rounds: int,
     shading: np.ndarray, frames: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 4). Columns of
-    the result: edge, its standard error, mean squared weighted residual, amplitude − 1. The standard error is that of a
-    sandwich (Huber 1967): the scatter of what the residuals of bands of rows would move the edge by, whatever made
-    them. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along).
+    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6). Columns of
+    the result: edge, its standard error, mean squared weighted residual, amplitude − 1, level, number of pixels. The
+    standard error is that of a sandwich (Huber 1967): the scatter of what the residuals of bands of rows would move
+    the edge by, whatever made them. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along).
     """
-    columns, bands = strip.shape[2], np.zeros((min(BANDS, strip.shape[1]), 2))
-    out = np.full((len(frames), 4), np.nan)
+    columns, bands = strip.shape[2], np.zeros((min(BANDS, strip.shape[1]), 3))
+    out = np.full((len(frames), 6), np.nan)
     max_lag = lag.max()
     half, middle, table_length = 0.0, 0, -1.0
     table, shading32 = np.empty((0, 0, 0), np.float32), shading.astype(np.float32)
@@ -142,33 +142,39 @@ def fit_edges(
             half = coverage_reach(length, blur) + margin
             table = coverage_table(length, blur, half).astype(np.float32)
             middle = math.ceil(half) + 1
-        amplitude = 0.0
+        amplitude, level = 0.0, 0.0
         for _ in range(rounds):
             first = max(0, math.ceil(y - half - max_lag))
             last = min(columns, int(y + half) + 1)
-            used, (yy, yg, gg, ry, rg, chi, less) = _normal_sums(
+            used, (yy, yg, yl, gg, gl, ll, ry, rg, rl, chi, less) = _normal_sums(
                 strip[t], np.float32(scale[t]), np.float32(offset[t]), appearance, y, lag, half, first, last,
-                middle, table, shading32, np.float32(1 + amplitude), bands,
+                middle, table, shading32, np.float32(1 + amplitude), np.float32(level), bands,
             )  # fmt: skip
-            yy, gg, rg = yy + 1e-12, gg + prior_sd**-2, rg - amplitude * prior_sd**-2
-            along = yg / gg  # the amplitude eliminated from the normal equations
-            info = yy - yg * along
+            yy, gg, ll = yy + 1e-12, gg + prior_sd**-2, ll + prior_sd**-2
+            rg, rl = rg - amplitude * prior_sd**-2, rl - level * prior_sd**-2
+            # Level and amplitude eliminated from the 3 by 3 normal equations.
+            det = gg * ll - gl * gl
+            ag, al = (yg * ll - yl * gl) / det, (yl * gg - yg * gl) / det
+            info = yy - yg * ag - yl * al
             if info <= 1e-9:
                 break
-            step = (ry - along * rg) / info
-            amplitude = min(max(amplitude + (rg - yg * step) / gg, -0.7), 1.5)
+            step = (ry - ag * rg - al * rl) / info
+            amplitude += (ll * (rg - yg * step) - gl * (rl - yl * step)) / det
+            level += (gg * (rl - yl * step) - gl * (rg - yg * step)) / det
+            amplitude, level = min(max(amplitude, -0.7), 1.5), min(max(level, -0.7), 0.7)
             limit = 1.0 + 0.25 * lengths[t]
             y += min(max(step, -limit), limit)
             moved = 0.0
             for band in range(len(bands)):
-                moved += (bands[band, 0] - along * bands[band, 1]) ** 2
+                moved += (bands[band, 0] - ag * bands[band, 1] - al * bands[band, 2]) ** 2
             # 0.3: least curvature of ln L, as a part of that without outliers (chosen)
             curvature = info * max(1 - less / yy, 0.3)
             out[i, 1] = math.sqrt(moved * len(bands) / max(len(bands) - 1, 1)) / curvature
             out[i, 2] = chi / max(used, 1.0)
+            out[i, 5] = used
             if abs(step) < 1e-3:
                 break
-        out[i, 0], out[i, 3] = y, amplitude
+        out[i, 0], out[i, 3], out[i, 4] = y, amplitude, level
     return out
 
 
@@ -177,15 +183,15 @@ def fit_edges(
 def _normal_sums(
     picture: np.ndarray, scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float, lag: np.ndarray,
     half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray, gain: np.float32,
-    bands: np.ndarray,
-) -> tuple[int, tuple[float, float, float, float, float, float, float]]:  # fmt: skip
-    """Number of pixels near the edge, and over them the sums of the normal equations for edge and amplitude; of squared
-    residuals, weighted; and what these take from the curvature of ln L. The weights 1/(variance + r²/9), as of
+    level: np.float32, bands: np.ndarray,
+) -> tuple[int, tuple[float, float, float, float, float, float, float, float, float, float, float]]:  # fmt: skip
+    """Number of pixels near the edge, and over them the sums of the normal equations for edge, amplitude and level; of
+    squared residuals, weighted; and what these take from the curvature of ln L. The weights 1/(variance + r²/9), as of
     Student's t with nine degrees of freedom, limit the influence of outliers; the shading of the tip, one for all rows,
-    is known to a third of itself. `bands`, shape (n_bands, 2), takes the sums with the residuals of each band of rows.
+    is known to a third of itself. `bands`, shape (n_bands, 3), takes the sums with the residuals of each band of rows.
     """
     zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
-    yy = yg = gg = ry = rg = chi = less = zero
+    yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = less = zero
     used = 0
     bands[:] = 0.0
     for u in range(len(picture)):
@@ -202,53 +208,40 @@ def _normal_sums(
         f, fraction = np.float32(table_fraction), np.float32(row_edge - whole_px)
         first_bin = a - whole_px + (len(shading) - 1) // 2
         shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
-        above_y, above_g = ry, rg
+        above_y, above_g, above_l = ry, rg, rl
         for i in range(m):
             p = low[i] + f * (high[i] - low[i])
             slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
             contrast = film[i] - background[i]
             shading_slope = shade_before[i] - shade_after[i]
             shade = shade_after[i] + fraction * shading_slope
+            excess = np.float32(values[i]) * scale + offset - background[i] - shade
             variance = p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
             dg = contrast * p
             dy = contrast * gain * slope + shading_slope
-            r = np.float32(values[i]) * scale + offset - background[i] - shade - gain * dg
+            r = excess - gain * dg - contrast * level
             w = unit / (variance + (r * r + shade * shade) * ninth)
-            wy, wr = w * dy, w * r
+            wy, wg, wl = w * dy, w * dg, w * contrast
             yy += wy * dy
             yg += wy * dg
-            gg += w * dg * dg
+            yl += wy * contrast
+            gg += wg * dg
+            gl += wg * contrast
+            ll += wl * contrast
             ry += wy * r
-            rg += dg * wr
-            chi += wr * r
-            less += wy * dy * wr * r
+            rg += wg * r
+            rl += wl * r
+            chi += w * r * r
+            less += wy * dy * w * r * r
         band = u * len(bands) // len(picture)
         bands[band, 0] += ry - above_y
         bands[band, 1] += rg - above_g
+        bands[band, 2] += rl - above_l
         used += m
     return used, (
-        float(yy), float(yg), float(gg), float(ry), float(rg), float(chi), 2 / 9 * float(less)
+        float(yy), float(yg), float(yl), float(gg), float(gl), float(ll), float(ry), float(rg), float(rl), float(chi),
+        2 / 9 * float(less),
     )  # fmt: skip
-
-
-@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def votes(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, soft: float
-) -> np.ndarray:
-    """Sum over each column of each frame of its pixels' votes: near −1 where one looks as in the `last` picture, near 1
-    as in the `first`, half where these differ by `soft`. Shapes: first, last (n_across, n_along) → (n_frames, n_along).
-    """
-    n, rows, columns = strip.shape
-    out, unit = np.zeros((n, columns), np.float32), np.float32(1.0)
-    weight = unit / (np.abs(last - first) + np.float32(soft))
-    for t in range(n):
-        gain, level, sums = np.float32(scale[t]), np.float32(offset[t]), out[t]
-        for u in range(rows):
-            values, before, after, factor = strip[t, u], first[u], last[u], weight[u]
-            for s in range(columns):
-                value = np.float32(values[s]) * gain + level
-                sums[s] += (abs(value - after[s]) - abs(value - before[s])) * factor[s]
-    return out
 
 
 # ------------------------------------------------------------------------------
@@ -319,14 +312,11 @@ def _gather(
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def solve(
-    sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float, clear: float
-) -> np.ndarray:
+def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
     """Brightness of film and background at every pixel, and the variance about each. A pixel at which one of the two is
     never visible, or whose background changes (a door swings there), takes it from its row: film from the columns
-    behind it, background from those ahead, with weights that fall as `decay`^distance. Before the column `clear`, where
-    a door may stand that leaves, the variance holds what the background differs by from that ahead. Shapes: sums (2, 3,
-    n_across, n_along) → (4, n_across, n_along).
+    behind it, background from those ahead, with weights that fall as `decay`^distance. Shapes: sums (2, 3, n_across,
+    n_along) → (4, n_across, n_along).
     """
     rows, columns = sums.shape[2:]
     out = np.empty((4, rows, columns), np.float32)
@@ -342,93 +332,71 @@ def solve(
                     # Shrunk towards the noise if there are few frames
                     observed = max(squares / count - (total / count) ** 2, 0.0)
                     variance = max((count * observed + 2 * noise**2) / (count + 2), noise**2)
+                changes = part == 1 and variance >= variance_limit
                 if weight > 1e-3:
                     guess = neighbours / weight
                 elif count > 0:
                     guess = total / count
-                if part == 1 and s < clear and count > 0:
-                    variance += (total / count - guess) ** 2
-                changes = part == 1 and variance >= variance_limit
                 known = count > 0.1 and not changes
                 out[part, u, s] = (total + ridge * guess) / (count + ridge) if known else guess
-                out[2 + part, u, s] = (
-                    variance if known else (max(variance, 1.1 * texture**2) if changes else texture**2)
-                )
+                out[2 + part, u, s] = variance if known else (1.1 if changes else 1.0) * texture**2
                 neighbours = neighbours * decay + (0.0 if changes else total)
                 weight = weight * decay + (0.0 if changes else count)
     return out
 
 
 # ------------------------------------------------------------------------------
-# What an edge fit leaves, from which the shape of the tip, its light and shade, its blur and the exposure follow.
+# What an edge fit leaves, from which the shape of the tip, its light and shade, its blur and the noise follow.
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def residual_sums(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fits: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
-    blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray, low: int, high: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """What fits leave about the edge in their frames: sums over the pixels of each row of the slope of ln L by the
-    row's lag, and of its curvature, (2, n_across); sums by distance ahead of the edge, in the bins of `shading`, of
-    weighted residuals and of weights, (2, n_distances); and for each fit the number of pixels, the sum over them of
-    log(1 + r²/9v), with v the mean of both variances, so that a wider blur does not lower its own misfit, and −ln L,
-    (n_fits, 3). Columns from `low` to `high` count. Shapes: fits (n_fits, 4); frames (n_fits,).
+def residuals(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
+    blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Pixels about the edge, by distance ahead of the whole column of their row's own edge, in the bins of `shading`:
+    residual r, weight (0 where there is no pixel), derivative of the model by the row's lag, and r²/9v, v the mean of
+    both variances, shape (4, n_used, n_across, n_distances). And the part of a column by which the
+    edge lies further, (n_used, n_across). Shapes: fit (n_frames, 6); frames (n_used,).
     """
     _, rows, columns = strip.shape
-    by_row, misfit = np.zeros((2, rows)), np.zeros((len(frames), 3))
-    by_distance, ahead = np.zeros((2, len(shading)), np.float32), np.zeros((2, len(shading)), np.float32)
-    zero, unit, ninth, shading32 = np.float32(0.0), np.float32(1.0), np.float32(1 / 9), shading.astype(np.float32)
-    weights, weighted, excess, variances = np.ones((4, len(shading)), np.float32)
+    out, fractions = np.zeros((4, len(frames), rows, len(shading)), np.float32), np.zeros((len(frames), rows))
+    unit, ninth, shading32 = np.float32(1.0), np.float32(1 / 9), shading.astype(np.float32)
     for used in range(len(frames)):
-        t, y, gain = frames[used], fits[used, 0], np.float32(1 + fits[used, 3])
-        length = lengths[t]
-        factor, dark = np.float32(scale[t]), np.float32(offset[t])
+        t = frames[used]
+        y, length = fit[t, 0], lengths[t]
+        gain, level, factor, dark = (
+            np.float32(1 + fit[t, 3]),
+            np.float32(fit[t, 4]),
+            np.float32(scale[t]),
+            np.float32(offset[t]),
+        )
         half = coverage_reach(length, blur) + margin
         table, middle = coverage_table(length, blur, half).astype(np.float32), math.ceil(half) + 1
-        first, last = max(low, math.ceil(y - half - lag.max())), min(high, columns, int(y + half) + 1)
+        first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
         for u in range(rows):
             row_edge = y - lag[u]
             whole_px, j, table_fraction = subpixel_index(row_edge)
             a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
+            fractions[used, u] = row_edge - whole_px
             if b <= a:
                 continue
             k, m, d = a - whole_px + middle, b - a, a - whole_px + (len(shading) - 1) // 2
             f, fraction = np.float32(table_fraction), np.float32(row_edge - whole_px)
-            lower, upper = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
             low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
             values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
             film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
             shade_before, shade_after = shading32[d - 1 : d - 1 + m], shading32[d : d + m]
-            slope_sum = curvature = zero
+            residual, weight = out[0, used, u, d : d + m], out[1, used, u, d : d + m]
+            slope, square = out[2, used, u, d : d + m], out[3, used, u, d : d + m]
             for i in range(m):
-                p, contrast = lower[i] + f * (upper[i] - lower[i]), film[i] - background[i]
-                modelled = background[i] + contrast * gain * p
+                p, contrast = low[i] + f * (high[i] - low[i]), film[i] - background[i]
+                modelled = background[i] + contrast * (gain * p + level)
                 modelled += shade_after[i] + fraction * (shade_before[i] - shade_after[i])
                 r = np.float32(values[i]) * factor + dark - modelled
                 variance = p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
-                w = unit / (variance + r * r * ninth)
-                slope = -contrast * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
-                weights[i], weighted[i] = w, w * r
-                variances[i] = variance
-                excess[i] = unit + r * r * (np.float32(2.0) * ninth) / (film_variance[i] + background_variance[i])
-                slope_sum += w * slope * r
-                curvature += w * slope * slope
-            by_row[0, u] += slope_sum
-            by_row[1, u] += curvature
-            misfit[used, 0] += m
-            # The row's edge lies between two whole columns: each pixel counts in two bins.
-            for part, summed in enumerate((weighted, weights)):
-                here, next_bin = by_distance[part, d : d + m], ahead[part, d : d + m]
-                for i in range(m):
-                    here[i] += (unit - fraction) * summed[i]
-                    next_bin[i] += fraction * summed[i]
-            for piece in range(0, m, 64):  # a logarithm for as many pixels as a product surely holds
-                excesses = spread = weighing = 1.0
-                for i in range(piece, min(piece + 64, m)):
-                    excesses *= excess[i]
-                    spread *= variances[i]
-                    weighing *= weights[i]
-                misfit[used, 1] += math.log(excesses)
-                misfit[used, 2] -= 5 * math.log(weighing) + 4.5 * math.log(spread)
-    by_distance[:, :-1] += ahead[:, 1:]
-    return by_row, by_distance, misfit
+                residual[i], weight[i] = r, unit / (variance + r * r * ninth)
+                slope[i] = -contrast * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
+                square[i] = np.float32(2.0) * ninth * r * r / (film_variance[i] + background_variance[i])
+    return out, fractions

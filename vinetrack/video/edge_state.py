@@ -19,7 +19,7 @@ MEMORY_FRAMES = 6.0
 TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
-MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine the amplitude (chosen)
+MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
@@ -40,7 +40,9 @@ class EdgeState:
 
 
 def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Return the length of the motion blur in every frame, (n_frames,): smoothed speed times exposure."""
+    """Return the length of the motion blur in every frame: smoothed speed times exposure. Shapes: edge (n_frames,) →
+    (n_frames,).
+    """
     if len(edge) < 3:
         return np.zeros(len(edge))
     speed = np.gradient(edge)
@@ -49,14 +51,18 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
 
 
 def moving_frames(edge: Floats) -> Bools:
-    """Return the frames in which the edge moves, (n_frames,); all frames if fewer than five do."""
+    """Return the frames in which the edge moves; all frames if fewer than five do. Shapes: edge (n_frames,) →
+    (n_frames,).
+    """
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
     moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
 def informative_frames(edge: Floats) -> Bools:
-    """The frames that determine film, background and tip shape: in motion, and MEMORY_CUTOFF memories around."""
+    """Return the frames that determine film, background and tip shape. They are the frames in motion, and MEMORY_CUTOFF
+    memories before and after. Shapes: edge (n_frames,) → (n_frames,).
+    """
     moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * kernels.MEMORY_CUTOFF)
     frames = np.arange(len(edge))
     return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
@@ -83,21 +89,31 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
-    clear_px = clear_of_start(state.edge)
-    solved = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD, clear_px)
-    return replace(state, appearance=solved)
+    appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
+    # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
+    # too far back, film serves as its own background; without contrast nothing corrects it.
+    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
+    columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
+    near = (columns > state.edge[0] - 5) & (columns < clear)
+    later = (columns >= clear) & (columns < state.edge.max() - 5)
+    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
+    film_all_along = near & (contrast < 0.4 * float(np.median(contrast[later]))) if later.sum() >= 10 else near & False
+    if film_all_along.any():
+        sums[1, :, :, film_all_along] = 0.0
+        appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
+    return replace(state, appearance=appearance)
 
 
 def clear_of_start(edge: Floats) -> float:
-    """The column beyond which nothing that held the tip at its start is near: START_CLEARANCE_PX, or a fifth of the
-    growth if that is less, beyond the start.
+    """Return the column beyond which nothing that held the tip at its start is near. It lies START_CLEARANCE_PX, or a
+    fifth of the growth if that is less, beyond the start. Shapes: edge (n_frames,).
     """
     return float(edge[0] + min(START_CLEARANCE_PX, 0.2 * (edge.max() - edge[0])))
 
 
 def core_frames(state: EdgeState, fit: Floats) -> Bools:
     """Select the frames that determine the shape of the tip. They are in motion, clear of the start, and fit no worse
-    than most. Shapes: fit (n_frames, 4) → (n_frames,).
+    than most. Shapes: fit (n_frames, 6) → (n_frames,).
     """
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
@@ -110,11 +126,11 @@ def core_frames(state: EdgeState, fit: Floats) -> Bools:
 
 
 def fit_edges(strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS) -> Floats:
-    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 4), NaN
+    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6), NaN
     in the other frames.
     """
     frames = np.flatnonzero(np.isfinite(state.edge) & chosen)
-    out = np.full((len(state.edge), 4), np.nan)
+    out = np.full((len(state.edge), 6), np.nan)
     out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds)
     return out
 
@@ -123,7 +139,7 @@ def search_edges(strip: Strip, state: EdgeState, frames: Indices, starts: Floats
     """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
     (n_searches,).
     """
-    contrast_prior_sd = 0.15  # Prior deviation of the relative amplitude of the contrast in one frame (chosen)
+    contrast_prior_sd = 0.15  # Prior deviation of relative amplitude and level of the contrast in one frame (chosen)
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, starts, state.lengths, state.lag, state.blur, state.appearance,
         contrast_prior_sd, MARGIN_PX, rounds, _padded_shading(state, MARGIN_PX), frames,
@@ -140,26 +156,26 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
     return padded
 
 
-def residual_sums(
-    strip: Strip, state: EdgeState, fits: Floats, frames: Indices, margin_px: float, span: tuple[int, int] | None = None
-) -> tuple[Floats, Floats, Floats]:
-    """What fits leave in their frames; see `edge_kernels.residual_sums`."""
-    found: tuple[Floats, Floats, Floats] = kernels.residual_sums(
-        strip.values, strip.scale, strip.offset, fits, state.lengths, state.lag, state.blur, state.appearance,
-        margin_px, frames, _padded_shading(state, margin_px), *(span or (0, strip.values.shape[2])),
-    )  # fmt: skip
-    return found
-
-
-def residuals_of(
+def residuals(
     strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX
-) -> tuple[Floats, Floats, float]:
-    """The first two of `residual_sums` in the frames of `use`, with the edges of the state; and the mean misfit."""
-    frames = np.flatnonzero(use)
-    fits = np.nan_to_num(fit[frames])
-    fits[:, 0] = state.edge[frames]
-    by_row, by_distance, misfit = residual_sums(strip, state, fits, frames, margin_px)
-    return by_row, by_distance, float(misfit[:, 1].sum() / max(misfit[:, 0].sum(), 1.0))
+) -> tuple[NDArray[np.float32], Floats]:
+    """What a fit leaves in the frames of `use`; see `edge_kernels.residuals`. Shapes: fit (n_frames, 6); use
+    (n_frames,).
+    """
+    filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
+    filled[:, 0] = state.edge
+    return kernels.residuals(
+        strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
+        margin_px, frames, shading,
+    )  # fmt: skip
+
+
+def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> float:
+    """Return the robust misfit of a fit, the mean of log(1 + r²/9v). v does not depend on the blur: a wider one would
+    lower its own misfit.
+    """
+    (_, weight, _, square), _ = residuals(strip, state, fit, use, margin_px)
+    return float(np.log(1 + square).sum(dtype=float) / max(np.count_nonzero(weight), 1))
 
 
 # ------------------------------------------------------------------------------
@@ -173,20 +189,21 @@ OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel t
 def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur. Both come from
     the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
-    them. Shapes: fit (n_frames, 4).
+    them. Shapes: fit (n_frames, 6).
     """
     largest_lag_step_px = 4.0  # Largest change of a row's lag in one round (chosen)
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        slope_of_row, known = residuals_of(strip, state, fit, slow)[0]
+        (residual, weight, slope, _), _ = residuals(strip, state, fit, slow)
+        slope_of_row, known = ((weight * slope * factor).sum(axis=(0, 2), dtype=float) for factor in (residual, slope))
         step = slope_of_row / (known + 0.02 * float(known.max()) + 1e-9)
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
         lag, lead = _smooth_lag(state.lag + step, known)
         state = replace(state, lag=lag, edge=state.edge - lead)
-    # 16: frames from which the blur is estimated (chosen); 1.3: step to the blurs that are tried (chosen)
+    # 16: frames from which the blur is estimated (chosen)
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
-    candidates = state.blur * np.array([1 / 1.3, 1.0, 1.3])
+    candidates = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])  # Blurs that are tried, px (chosen)
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
     misfits = []
@@ -195,20 +212,26 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
         fit = fit_edges(strip, blurred, np.isin(np.arange(len(state.edge)), sampled), EARLY_FIT_ROUNDS)
         use = np.isfinite(fit[:, 0])
         blurred = replace(blurred, edge=np.where(use, fit[:, 0], state.edge))
-        misfits.append(residuals_of(strip, blurred, fit, use, widest - coverage_reach(0.0, blur))[2])
+        misfits.append(misfit(strip, blurred, fit, use, widest - coverage_reach(0.0, blur)))
     return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate what the tip shows beyond film and background, by distance ahead of the edge. A round tip is lit
     differently from the tube behind it: its rim may be as bright as the background where the film is darker, and the
-    edge would be fitted behind the rim. Shapes: fit (n_frames, 4).
+    edge would be fitted behind the rim. Shapes: fit (n_frames, 6).
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        by_distance = residuals_of(strip, state, fit, core)[1]
-        middle = by_distance.shape[1] // 2
-        residual_sum, known = by_distance[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
+        (residual, weight, *_), fraction = residuals(strip, state, fit, core)
+        # The row's edge lies between two whole columns: each pixel counts in two bins.
+        sums = np.zeros((2, weight.shape[2]))
+        for total, part in zip(sums, (weight * residual, weight), strict=True):
+            ahead = np.einsum("tu,tud->d", fraction, part)
+            total[:] = part.sum(axis=(0, 1), dtype=float) - ahead
+            total[:-1] += ahead[1:]
+        middle = sums.shape[1] // 2
+        residual_sum, known = sums[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
         step = residual_sum / np.maximum(known, 1e-3 * float(known.max()) + 1e-12)
         # (0.25, 0.5, 0.25): smoothing kernel of the tip's shading (chosen)
         state = replace(state, shading=np.convolve(state.shading + step, (0.25, 0.5, 0.25), mode="same"))
@@ -228,7 +251,7 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
         return np.nan, np.nan
     bare, tried = replace(state, shading=np.zeros_like(state.shading)), EXPOSURES.tolist()
     tried += [stated_frames] if np.isfinite(stated_frames) else []
-    misfits = np.array([residuals_of(strip, replace(bare, lengths=speed * tau), fit, fast)[2] for tau in tried])
+    misfits = np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, fast) for tau in tried])
     # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
     agrees = len(tried) > len(EXPOSURES) and misfits[-1] <= 1.01 * misfits.min()
     seen = np.nan if agrees else _least_misfit(EXPOSURES, misfits[: len(EXPOSURES)])
