@@ -250,9 +250,9 @@ def solve(
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )
-    # 5, 4: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
+    # 5, 2: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
     # many of these searches may move one (chosen)
-    searches_left, at_corner = 4, False
+    searches_left, at_corner = 2, False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state

@@ -1,6 +1,7 @@
-"""Estimates of the trial effects at given parameters, and a search for releases that no frame shows.
+"""Estimates of the trial effects at given parameters, and a search for the release of each trial.
 
-Release, origin and deviations of a trial are correlated: where no frame shows it at rest its misfit has several minima.
+Release, origin and deviations of a trial are correlated, so that its misfit may have several minima: above all where no
+frame shows it at rest, and where a vine starts so slowly that its first frames hardly differ from rest.
 """
 
 from __future__ import annotations
@@ -156,21 +157,25 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 
 def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
-    """The state with releases at which trials that no frame shows at rest are likelier, their effects integrated out;
-    None if there are none. From each of many releases before the first frame one step leads to effects that suit it,
-    from the likeliest a few more; a trace shows the release of a vine that was pressurised during the recording.
+    """The state with releases at which trials are likelier, their effects integrated out; None if there are none. From
+    each of many releases, before the first frame where no frame shows the rest and about the current one elsewhere, one
+    step leads to effects that suit it, from the likeliest a few more. A trace shows the release of a vine that was
+    pressurised during the recording.
     """
-    unseen = [not (one.shows_rest or one.pressurised_in_recording) for one in predictor.data]
-    if not any(unseen):
+    rows = np.flatnonzero([not one.pressurised_in_recording for one in predictor.data])
+    if not rows.size:
         return None
-    rows = np.flatnonzero(unseen)
     predictor, problem, (current,) = subset(predictor, problem, rows, state)
     first_s, duration_s = (np.array([f(one.time_s) for one in predictor.data]) for f in (np.min, np.ptp))
+    shows_rest, frames_s = np.array([one.shows_rest for one in predictor.data]), predictor.frames_s
     best, least = current, (before := _trial_deviances(predictor, problem, current))
-    # 12, 0.1: releases that are tried, from so many frames before the first to the duration of the track (chosen)
-    for part in np.linspace(0.0, 1.0, 12):
+    # 0.1: releases that are tried, from so many frames before the first to the duration of the track, and frames from
+    # the current one (chosen)
+    frames_off = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
+    for part, off in zip(np.linspace(0.0, 1.0, len(frames_off)), frames_off, strict=True):
         effects = current.trial_effects.copy()
-        effects[:, RELEASE] = first_s - duration_s**part * (0.1 * predictor.frames_s) ** (1 - part)
+        early_s = first_s - duration_s**part * (0.1 * frames_s) ** (1 - part)
+        effects[:, RELEASE] = np.where(shows_rest, effects[:, RELEASE] + off * frames_s, early_s)
         with suppress(SimulationError):
             tried, _ = optimise_trial_effects(predictor, problem, replace(current, trial_effects=effects))
             deviances = _trial_deviances(predictor, problem, tried)
