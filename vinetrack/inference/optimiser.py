@@ -32,7 +32,7 @@ from vinetrack.inference.marginal_likelihood import (
 )
 from vinetrack.inference.sensitivity import Predictor, initial_trial_effects
 from vinetrack.inference.trial_effects import (
-    likelier_releases,
+    ReleaseSearch,
     limited_step,
     optimise_trial_effects,
     residuals_in,
@@ -250,9 +250,9 @@ def solve(
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )
-    # 5, 2: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
+    # 5, 4: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
     # many of these searches may move one (chosen)
-    searches_left, at_corner = 2, False
+    searches_left, releases, at_corner = 4, ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
@@ -282,7 +282,7 @@ def solve(
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (small_step or iteration % 5 == 0):
-            relocated = likelier_releases(predictor, problem, state)
+            relocated = releases.likelier(state, residuals_in(columns))
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
                 searches_left -= 1

@@ -1,21 +1,22 @@
-"""Estimates of the trial effects at given parameters, and a search for the release of each trial.
+"""Estimates of the trial effects at given parameters, and a global search for the release of each trial.
 
-Release, origin and deviations of a trial are correlated, so that its misfit may have several minima: above all where no
-frame shows it at rest, and where a vine starts so slowly that its first frames hardly differ from rest.
+Release, origin and deviations of a trial are correlated, so that its misfit may have several local minima: above all
+where no frame shows it at rest, and where a vine starts so slowly that its first frames hardly differ from rest. Since
+a trajectory depends only on the time since release, one simulation, shifted in time, gives the misfit of every release.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.core.threads import njit
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
@@ -29,10 +30,57 @@ from vinetrack.inference.marginal_likelihood import (
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
+    ORIGIN,
     PRESSURE,
     RELEASE,
+    Jobs,
     Predictor,
 )
+
+# ------------------------------------------------------------------------------
+# Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
+#
+# A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was
+# three quarters of the time of a fit that continues from another.
+
+
+@njit(nogil=True, error_model="numpy")
+def white_at_releases(
+    time_s: Floats,
+    position_m: Floats,
+    first: NDArray[np.bool_],
+    relative_sd: Floats,
+    releases_s: Floats,
+    grid_s: Floats,
+    curves: Floats,
+    rho: float,
+) -> Floats:
+    """Whitened columns and residual of a trial for each candidate release, as `whiten` makes them. Curves are
+    interpolated linearly, and constant beyond the ends of the grid. The last column is the residual. Shapes: time_s,
+    position_m, first, relative_sd (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) →
+    (n_releases, n_columns, n_points).
+    """
+    count, size, last = len(curves), len(time_s), len(grid_s) - 1
+    begins = math.sqrt(1 - rho**2)
+    plain, white = np.empty((count, size)), np.empty((len(releases_s), count, size))
+    for r in range(len(releases_s)):
+        j = 0
+        for i in range(size):
+            since_s = min(max(time_s[i] - releases_s[r], 0.0), grid_s[last])
+            while j < last - 1 and grid_s[j + 1] <= since_s:
+                j += 1
+            part = (since_s - grid_s[j]) / (grid_s[j + 1] - grid_s[j])
+            for c in range(count):
+                plain[c, i] = curves[c, j] + part * (curves[c, j + 1] - curves[c, j])
+            plain[count - 1, i] = position_m[i] - plain[count - 1, i]
+        for c in range(count):
+            before = 0.0
+            for i in range(size):
+                value = plain[c, i] / relative_sd[i]
+                white[r, c, i] = begins * value if first[i] else value - rho * before
+                before = value
+    return white
+
 
 # ------------------------------------------------------------------------------
 # Restriction of a fit to a subset of its trials: free parameters, predictor, state and problem.
@@ -156,41 +204,69 @@ def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
 LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)
 
 
-def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
-    """The state with releases at which trials are likelier, their effects integrated out; None if there are none. From
-    each of many releases, before the first frame where no frame shows the rest and about the current one elsewhere, one
-    step leads to effects that suit it, from the likeliest a few more. A trace shows the release of a vine that was
-    pressurised during the recording.
+class ReleaseSearch:
+    """Global search for the releases during a fit. A release jumps where the trial's likelihood, its effects integrated
+    out, is higher.
     """
-    rows = np.flatnonzero([not one.pressurised_in_recording for one in predictor.data])
-    if not rows.size:
-        return None
-    predictor, problem, (current,) = subset(predictor, problem, rows, state)
-    first_s, duration_s = (np.array([f(one.time_s) for one in predictor.data]) for f in (np.min, np.ptp))
-    shows_rest, frames_s = np.array([one.shows_rest for one in predictor.data]), predictor.frames_s
-    best, least = current, (before := _trial_deviances(predictor, problem, current))
-    # 0.1: releases that are tried, from so many frames before the first to the duration of the track, and frames from
-    # the current one (chosen)
-    frames_off = (-12.0, -8.0, -5.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
-    for part, off in zip(np.linspace(0.0, 1.0, len(frames_off)), frames_off, strict=True):
-        effects = current.trial_effects.copy()
-        early_s = first_s - duration_s**part * (0.1 * frames_s) ** (1 - part)
-        effects[:, RELEASE] = np.where(shows_rest, effects[:, RELEASE] + off * frames_s, early_s)
-        with suppress(SimulationError):
-            tried, _ = optimise_trial_effects(predictor, problem, replace(current, trial_effects=effects))
-            deviances = _trial_deviances(predictor, problem, tried)
-            likelier = (deviances < least)[:, None]
-            best = replace(best, trial_effects=np.where(likelier, tried.trial_effects, best.trial_effects))
-            least = np.minimum(deviances, least)
-    # 3: further steps of the trial effects before another release is compared with the current one (chosen)
-    for _ in range(3):
-        best, _ = optimise_trial_effects(predictor, problem, best)
-    better = _trial_deviances(predictor, problem, best) < before - LEAST_DECREASE
-    if not better.any():
-        return None
-    effects = state.trial_effects.copy()
-    effects[rows[better]] = best.trial_effects[better]
-    return replace(state, trial_effects=effects)
+
+    def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
+        self.predictor, self.problem = predictor, problem
+
+    def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
+        """The state with likelier releases; None if there are none. The search leaves out trials pressurised during the
+        recording, whose release the trace shows, and trials recorded at rest with a misfit far above noise, which
+        another release would only compensate. Shapes: residuals (n_points,).
+        """
+        proposed = self._by_linear_model(state, residuals)
+        accepted = state if proposed is None else self._confirmed(state, proposed)
+        return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
+
+    def _by_linear_model(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
+        """The state with each trial at its likeliest release by the linear model; None if no trial moves."""
+        predictor, problem = self.predictor, self.problem
+        misfit = trial_costs(predictor, problem, state, residuals) * state.variance
+        misfit /= (1 - state.rho**2) * problem.points
+        # 30.0: mean squared residual of a trial, in variances of its noise, up to which its release is
+        # searched (chosen)
+        places = [
+            i
+            for i, trial_data in enumerate(predictor.data)
+            if not trial_data.pressurised_in_recording
+            and (not trial_data.shows_rest or misfit[i] < 30.0 * trial_data.noise_m**2)
+        ]
+        if not places:
+            return None
+        releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
+        jobs = predictor.jobs(state.theta, state.trial_effects)[places]
+        sensitivities = _release_sensitivities(predictor, jobs, releases)
+        trial_effects = state.trial_effects.copy()
+        centre, precision = trial_effect_prior(problem, state)
+        any_moved = False
+        for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
+            noise = state.rho, float(state.variance[i])
+            effects, gain = _best_release(
+                predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
+            )
+            if gain > LEAST_DECREASE:
+                trial_effects[i], any_moved = effects, True
+        return replace(state, trial_effects=trial_effects) if any_moved else None
+
+    def _confirmed(self, state: FitState, proposed: FitState) -> FitState:
+        """The state with those proposed effects that remain better after a few steps on simulated trajectories. Trials
+        without a proposal stay as they are.
+        """
+        rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
+        predictor, problem, (current, proposed) = subset(self.predictor, self.problem, rows, state, proposed)
+        # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
+        for _ in range(3):
+            proposed = optimise_trial_effects(predictor, problem, proposed)[0]
+        better = (
+            _trial_deviances(predictor, problem, proposed)
+            < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
+        )
+        trial_effects = state.trial_effects.copy()
+        trial_effects[rows[better]] = proposed.trial_effects[better]
+        return replace(state, trial_effects=trial_effects)
 
 
 def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
@@ -199,3 +275,80 @@ def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitStat
     square = whitened_products(predictor.products(columns), state)[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
     log_volume = np.linalg.slogdet(with_diagonal(square, trial_effect_prior(problem, state)[1]))[1]
     return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
+
+
+def _best_release(
+    trial_data: FitTrial,
+    trial_effects: Floats,
+    prior: tuple[Floats, Floats],
+    noise: tuple[float, float],
+    releases: Floats,
+    times: Floats,
+    plain: Floats,
+    sensitivities: Floats,
+) -> tuple[Floats, float]:
+    """Effects of one trial at its likeliest release, and the decrease of −2 ln L from the last of the releases. `prior`
+    are mean and precision of its effects, `noise` the correlation and the variance of the innovations.
+    """
+    centre, precision = prior
+    rho, variance = noise
+    relative = trial_data.point_sd
+    position_m = trial_data.lead_position_m - trial_effects[ORIGIN]
+    curves = np.vstack([sensitivities, plain])
+    white = white_at_releases(trial_data.time_s, position_m, trial_data.first, relative, releases, times, curves, rho)
+    square = white @ np.swapaxes(white, 1, 2) / variance
+    effects = np.tile(trial_effects, (releases.size, 1))
+    effects[:, RELEASE] = releases
+    information = square[:, :-1, :-1] + np.diag(precision)
+    shared_information, gradient = square[:, ORIGIN:-1, ORIGIN:-1], square[:, ORIGIN:-1, -1]
+    slope = gradient - (precision * (effects - centre))[:, ORIGIN:]
+    largest = np.array([np.inf, 0.3, 0.3])  # Largest change of origin and deviations (chosen)
+    step = np.clip(np.linalg.solve(information[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], -largest, largest)
+    effects[:, ORIGIN:] += step
+    residual_squares = square[:, -1, -1] - np.sum(
+        step * (2 * gradient - (shared_information @ step[..., None])[..., 0]), axis=1
+    )
+    deviances = (
+        residual_squares + np.sum(precision * (effects - centre) ** 2, axis=1) + np.linalg.slogdet(information)[1]
+    )
+    k = int(np.argmin(deviances))
+    return effects[k], float(deviances[-1] - deviances[k])
+
+
+def _candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
+    """Candidate releases of a trial, s, shape (n,); the last is the current one."""
+    if trial_data.shows_rest:
+        # Candidate releases of a trial recorded at rest, frames from the current one, which comes last (chosen)
+        frames = [*np.arange(-14.0, 15.0), -0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6, 0.0]
+        return release_s + trial_data.frame_s * np.array(frames)
+    duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
+    # 60: candidate releases of a trial recorded only in motion (chosen)
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
+
+
+def _release_sensitivities(
+    predictor: Predictor, plain: Jobs, releases: Sequence[Floats]
+) -> list[tuple[Floats, Floats, Floats]]:
+    """For each trial times since release, shape (n,), positions there, m, and their sensitivities to its effects.
+    Sensitivities have shape (4, n), zero for an effect that the trial does not have.
+    """
+    damping_step, pressure_step = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
+    with_pressure = predictor.has_pressure_deviation[plain.trial]
+    with_damping = predictor.has_damping_deviation[plain.trial]
+    pressures, dampings = plain[np.flatnonzero(with_pressure)], plain[np.flatnonzero(with_damping)]
+    pressures = replace(pressures, pressure_deviation=pressures.pressure_deviation + pressure_step)
+    dampings.row[:, predictor.damping_column] *= np.exp(damping_step)
+    longest_s = np.array([predictor.data[i].time_s[-1] - s.min() for i, s in zip(plain.trial, releases, strict=True)])
+    # 600: points of the time grid of a trajectory that is shifted (derived)
+    grids = longest_s * np.linspace(0.0, 1.0, 600)[:, None] ** 1.5
+    grids = np.concatenate([grids.T, grids.T[with_pressure], grids.T[with_damping]])
+    jobs = Jobs.concatenated([plain, pressures, dampings])
+    moved = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
+    y = np.array([trajectory.observed_position_m for trajectory in moved])
+    n, n_pressures = len(plain), len(pressures)
+    sensitivities = np.zeros((n, N_TRIAL_EFFECTS, grids.shape[1]))
+    sensitivities[:, RELEASE] = [-np.gradient(along_m, times) for along_m, times in zip(y, grids[:n], strict=False)]
+    sensitivities[:, ORIGIN] = 1.0
+    sensitivities[with_pressure, PRESSURE] = (y[n : n + n_pressures] - y[:n][with_pressure]) / pressure_step
+    sensitivities[with_damping, DAMPING_DEVIATION] = (y[n + n_pressures :] - y[:n][with_damping]) / damping_step
+    return list(zip(grids, y, sensitivities, strict=False))
