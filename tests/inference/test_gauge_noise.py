@@ -13,7 +13,7 @@ from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
 from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.sensitivity import PRESSURE, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -43,7 +43,7 @@ def test_exact_pressures_are_unchanged_and_equal_readings_handled():
     for exact_Pa in (LET_DOWN, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(5, 3.0)):
         np.testing.assert_array_equal(without_noise(exact_Pa), exact_Pa)
     told_Pa = 20e3 + 100.0 * (np.arange(60) == 30)  # readings that are nearly all equal
-    assert gauge.noise_correlation([told_Pa] * 4) == 0.0
+    assert gauge.noise_correlations([told_Pa] * 4) == [0.0]
     assert np.isfinite(without_noise(told_Pa)).all()
 
 
@@ -228,10 +228,22 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
     for rho in (0.0, 0.5, 0.85):
         falls = 20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3
         traces = [falls + ar1_noise(300, 100.0, rho, draw) for _ in range(24)]
-        told = gauge.noise_correlation(traces)
-        assert told == pytest.approx(rho, abs=0.05)
-        sigmas = [noise.sigma_Pa for noise in gauge.noise_of_traces(gauge.gauge_readings(traces), told)]
+        told = gauge.noise_correlations(traces)
+        assert told[0] == pytest.approx(rho, abs=0.05)
+        assert told[-1] == 0.0
+        sigmas = [noise.sigma_Pa for noise in gauge.noise_of_traces(gauge.gauge_readings(traces), rho)]
         assert np.mean(sigmas) == pytest.approx(100.0 * np.sqrt(1 - rho**2), rel=0.1)
+
+
+def test_noise_that_lasts_for_many_samples_leaves_no_waves():
+    """Its correlation is estimated as 0.78 for 0.85: more than half of its slow part would then be pressure."""
+    draw, tracks = np.random.default_rng(26), []
+    for count in range(100, 800, 20):
+        pressure_Pa = 8e3 + ar1_noise(count, 100.0, 0.85, draw)
+        tracks.append(as_track(np.arange(count) / 1500, np.linspace(0.0, 0.2, count), pressure_Pa))
+    quiet = gauge.denoised_traces(tracks)
+    assert np.mean([np.std(trace.pressure_Pa) for trace in quiet]) < 2.0
+    assert np.mean([trace.errors_Pa.shape[1] for trace in quiet]) < 3
 
 
 @pytest.mark.slow
@@ -294,26 +306,26 @@ def fit(laboratory):
 def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, laboratory):
     assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
     assert fit.chi2_per_dof < 1.1
-    errors = systematics_of(fit.predictor, fit.solution)
-    sizes = fit.with_errors.theta[len(fit.numbers) :][np.array(errors.sources) == "gauge"]
+    sizes = fit.with_errors.trial_effects[:, N_TRIAL_EFFECTS:]
+    sizes = sizes[sizes != 0.0]
     assert sizes.size >= 12
     assert 0.4 < np.sqrt(np.mean(sizes**2)) < 1.6
+    assert 0.0 < fit["n"].shared["gauge"] < fit["n"].sigma
 
 
 def test_an_error_of_a_trace_is_estimated(fit):
     """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
     shapes = systematics_of(fit.predictor, fit.solution, ["gauge"])
-    moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.columns]
+    assert not shapes.count
+    moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.own]
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)
     clock_s, pressure_Pa = data[which].trace
     data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 0]))
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
     solution = solving.solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
-    sources = np.array(systematics_of(fit.predictor, fit.solution).sources)
-    place = len(fit.numbers) + np.flatnonzero(sources == "gauge")[shapes.places[which, 0]]
-    after = with_systematics(moved, solution).solution.state
-    assert after.theta[place] - fit.with_errors.theta[place] == pytest.approx(-2.0, abs=0.5)
+    after, place = with_systematics(moved, solution).solution.state, (which, N_TRIAL_EFFECTS)
+    assert after.trial_effects[place] - fit.with_errors.trial_effects[place] == pytest.approx(-2.0, abs=0.5)
 
 
 def test_trace_errors_suggest_no_exponent_per_vine(fit):
@@ -344,11 +356,11 @@ def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_th
     data = [replace(trial_data, trace_errors_Pa=None) for trial_data in predictor.data]
     data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
     deaf = [replace(trial_data, trace_errors_Pa=None) for trial_data in data]
-    errors, without = (
-        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution) for told in (data, deaf)
+    moved, without = (
+        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution).own for told in (data, deaf)
     )
-    assert errors.count == without.count + 1
-    moved = [columns[:, :1] for columns in errors.columns]
+    assert [each.shape[1] for each in moved] == [1] * 16
+    assert [each.shape[1] for each in without] == [0] * 16
     assert all(not columns.any() for i, columns in enumerate(moved) if i != 3)
     part = np.interp(data[3].time_s, trace[0], ramp) / np.interp(data[3].time_s, *trace)
     expected = np.cumsum(np.diff(traced.solution.columns[3][:, PRESSURE], prepend=0.0) * part)

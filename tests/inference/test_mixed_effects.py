@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.errors import precision
 from vinetrack.inference.fit_result import _deviate
-from vinetrack.inference.gaussian_processes import all_products, at_correlation, products, whiten
+from vinetrack.inference.gaussian_processes import at_correlation, products, whiten
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 
 RHO, SIGMA = 0.45, 0.3
@@ -47,7 +47,7 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
 
 
 def crossed(columns: list[np.ndarray]) -> np.ndarray:
-    return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
+    return np.stack([products(each, np.arange(len(each)) == 0) for each in columns])
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance():

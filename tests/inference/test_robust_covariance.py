@@ -89,7 +89,7 @@ def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
     for _ in range(3000):
         values = 0.2 * draw.standard_normal(trials)
         scores = 25.0 * (values - values.mean())[:, None]
-        variance, degrees = errors.scatter_variances(information, scores, problem, plain)
+        variance, degrees = errors.scatter_variances(information, scores, problem, plain, 1)
         assert degrees[0] == pytest.approx(trials - 1)
         found.append(variance[0])
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)

@@ -32,7 +32,7 @@ from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, groups_of
 from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
 from vinetrack.inference.systematics import with_unknowns
 
 N_BY_VINE, ORDER_DRIFT, SPECIMEN = "n_by_vine", "order_drift", "specimen"
@@ -302,7 +302,7 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
         factors.append(term.scale * term.regressor)
         precisions.append((term.scale / term.prior_sd) ** 2)
     for key, how in difference.shared.items():
-        columns.append(N_TRIAL_EFFECTS + fit.predictor.layout.keys.index(key))
+        columns.append(base.problem.n_effects + fit.predictor.layout.keys.index(key))
         of_trials = groups_of([trial.trial for trial in fit.trials], how)
         groups.append(tuple("" if group == of_trials[0] else group for group in of_trials))
         factors.append(np.ones(len(of_trials)))

@@ -44,7 +44,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effect_prior,
 )
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
+from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ class Products:
 
     def without_trial_effects(self, state: FitState) -> Floats:
         """Those of unknowns, residual and shapes, the trial effects integrated out."""
-        restored = at_prior_means(self.white, self.problem, state, N_TRIAL_EFFECTS + self.n_unknowns)
+        restored = at_prior_means(self.white, self.problem, state, self.problem.n_effects + self.n_unknowns)
         return eliminated(restored, trial_effect_prior(self.problem, state)[1])[0]
 
 

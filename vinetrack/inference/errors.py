@@ -11,7 +11,6 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats, Trial
@@ -20,7 +19,6 @@ from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
-    Marginal,
     MixedProblem,
     at_unknowns,
     inverse_of_block,
@@ -39,7 +37,7 @@ from vinetrack.inference.optimiser import (
     update_variances,
     variance_change,
 )
-from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
@@ -78,16 +76,8 @@ class Precision:
 
 def precision(solution: Solution) -> Precision:
     """Covariance at the end of a fit, from the model of noise and between-trial variation."""
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    covariance, insensitive, collinear = _covariance(part, solution.problem, solution.state, solution.state.spread)
-    return Precision(covariance, np.full(len(covariance), math.inf), insensitive, collinear)
-
-
-def _covariance(
-    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
-) -> tuple[Floats, np.ndarray, np.ndarray]:
-    """Covariance of the free parameters, which of them are insensitive, and which are collinear."""
-    information = normal_equations(part, problem, state, spread)[0]
+    problem, state = solution.problem, solution.state
+    information = normal_equations(marginal(solution.cross_products, problem, state), problem, state, state.spread)[0]
     diagonal = np.diag(information)
     insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
     k = np.flatnonzero(problem.free & ~insensitive)
@@ -105,7 +95,7 @@ def _covariance(
         covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
     unknown = np.flatnonzero(insensitive | collinear)
     covariance[unknown, unknown] = math.inf
-    return covariance, insensitive, collinear
+    return Precision(covariance, np.full(len(covariance), math.inf), insensitive, collinear)
 
 
 def student(dof: Floats) -> Floats:
@@ -157,8 +147,7 @@ def _deviance_increase(
     free[place] = False
     theta = solution.state.theta.copy()
     step = value - theta[place]
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    covariance = _covariance(part, solution.problem, solution.state, solution.state.spread)[0]
+    covariance = precision(solution).covariance
     if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
         direction = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
         theta = np.clip(theta + direction * step, solution.problem.lower, solution.problem.upper)
@@ -198,9 +187,15 @@ def with_systematics(predictor: Predictor, solution: Solution, held: FixedTerms 
     errors = systematics_of(predictor, solution)
     extended = errors.beside(solution.columns)
     held = held or FixedTerms()
-    fixed_insensitive = replace(solution.problem, free=solution.problem.free & _sensitive(solution))
+    # The column of a parameter without influence is rounding error: with fixed columns, a step along it would be
+    # millions of scales long and predict a likelihood that no trajectory confirms.
+    fixed_insensitive = replace(solution.problem, free=solution.problem.free & ~precision(solution).insensitive)
     problem = errors.among(fixed_insensitive)
-    start = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(errors.count)))
+    start = replace(
+        solution.state,
+        theta=np.append(solution.state.theta, np.zeros(errors.count)),
+        trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
+    )
     state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start, held)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # errors, so it is subtracted.
@@ -225,16 +220,6 @@ def with_systematics(predictor: Predictor, solution: Solution, held: FixedTerms 
             for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
         ),
     )
-
-
-def _sensitive(solution: Solution) -> NDArray[np.bool_]:
-    """Free parameters that influence some trajectory. The column of a parameter without influence is rounding error.
-    With fixed columns, a step along it would be millions of scales long and predict a likelihood that no trajectory
-    confirms.
-    """
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
-    return np.asarray(np.diag(information) > LEAST_INFORMATION)
 
 
 def _newton_on_fixed_columns(
@@ -308,15 +293,12 @@ FEWEST_CLUSTERS = 8  # Clusters from which their scatter counts in tests of a mo
 
 def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats, Floats]:
     """Covariance of the free parameters by the noise model, (n_free, n_free); their variances from the scatter of
-    trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,). Parameters at a
-    bound are fixed there.
+    trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,); of systematic
+    errors those by the noise model. Parameters at a bound are fixed there.
     """
     problem, theta = solution.problem, solution.state.theta
     information, scores = trial_information(solution)
-    square = information.sum(axis=0) + np.diag(problem.prior_precision)
-    inside = (theta > problem.lower) & (theta < problem.upper)
-    estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
-    plain = inverse_of_block(square, estimated)
+    plain = _covariance_by_noise(solution, information)
     # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
     depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
@@ -324,20 +306,31 @@ def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, 
     trials = [trial_data.trial for trial_data in predictor.data]
     for groups in (range(len(trials)), coarsest_groups(trials)):
         by_scatter, few = scatter_variances(
-            _summed_over(groups, information), _summed_over(groups, scores), problem, plain
+            _summed_over(groups, information), _summed_over(groups, scores), problem, plain, len(predictor.layout.free)
         )
         degrees = np.where((by_scatter > variance) | np.isinf(degrees), few, degrees)
         variance = np.maximum(variance, by_scatter)
     return plain, variance, degrees
 
 
+def _covariance_by_noise(solution: Solution, information: Floats) -> Floats:
+    """Covariance of the unknowns by the noise model; those at a bound are fixed there. Shapes: information (n_trials,
+    n_free, n_free) → (n_free, n_free).
+    """
+    problem, theta = solution.problem, solution.state.theta
+    square = information.sum(axis=0) + np.diag(problem.prior_precision)
+    inside = (theta > problem.lower) & (theta < problem.upper)
+    return inverse_of_block(square, np.flatnonzero(problem.free & inside & (np.diag(square) > 0)))
+
+
 def scatter_variances(
-    information: Floats, scores: Floats, problem: MixedProblem, plain: Floats
+    information: Floats, scores: Floats, problem: MixedProblem, plain: Floats, count: int
 ) -> tuple[Floats, Floats]:
-    """Variances of the free parameters from the disagreement of clusters, and their degrees of freedom. Each cluster
-    pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in units of the
-    errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i). Shapes: information
-    (n_clusters, n_free, n_free); scores (n_clusters, n_free); plain (n_free, n_free) → (n_free,), (n_free,).
+    """Variances of the first `count` unknowns from the disagreement of clusters, and their degrees of freedom. Each
+    cluster pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in
+    units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i). Shapes:
+    information (n_clusters, n_free, n_free); scores (n_clusters, n_free); plain (n_free, n_free) →
+    (n_free,), (n_free,).
     """
     variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
     estimated = np.flatnonzero(np.diag(plain) > 0)
@@ -353,7 +346,7 @@ def scatter_variances(
     adjustments = (vectors * shown[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     hidden = (vectors * np.where(values < 0.99, 0.0, values)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     constant = root.T @ np.diag(problem.prior_precision[estimated]) @ root + hidden.sum(axis=0)
-    for k, place in enumerate(estimated.tolist()):
+    for k, place in enumerate(estimated[estimated < count].tolist()):
         weights_of_score = adjustments @ root[k]
         scatter = float(np.sum(np.einsum("nk,nk->n", weights_of_score, score) ** 2))
         moved = np.einsum("nij,nj->ni", shares, weights_of_score)
@@ -387,7 +380,20 @@ def widened_covariance(
         across = plain[:, source_of == source]
         known = np.linalg.pinv(plain[np.ix_(source_of == source, source_of == source)], hermitian=True)
         shared[source] = np.sum((across @ known) * across, axis=1) * ratio**2
+    if solution.problem.own_errors:
+        exact = _with_known_pressures(solution)
+        known_by = np.diag(_covariance_by_noise(exact, trial_information(exact)[0]))
+        shared["gauge"] = np.maximum(diagonal - known_by, 0.0) * ratio**2
     return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
+
+
+def _with_known_pressures(solution: Solution) -> Solution:
+    """The solution without the errors that gauges leave in single trials."""
+    own = np.s_[N_TRIAL_EFFECTS : solution.problem.n_effects]
+    cross_products = np.delete(np.delete(solution.cross_products, own, axis=2), own, axis=3)
+    state = replace(solution.state, trial_effects=solution.state.trial_effects[:, :N_TRIAL_EFFECTS])
+    problem = replace(solution.problem, own_errors=0)
+    return replace(solution, cross_products=cross_products, state=state, problem=problem)
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:

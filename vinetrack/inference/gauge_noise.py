@@ -308,11 +308,11 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
     return noises
 
 
-def noise_correlation(traces: Sequence[Floats]) -> float:
-    """Lag-one correlation of the noise of readings, the same in all traces; 0 unless significantly positive. If noise
-    is correlated, third differences of readings COMPARED_LAG apart are larger than those of neighbours. A changing
-    pressure has slow differences too, but not in most traces, so the median over traces is used. Shapes: traces
-    (n_readings,).
+def noise_correlations(traces: Sequence[Floats]) -> list[float]:
+    """Lag-one correlations that the noise of readings may have, the same in all traces: an estimate, others within two
+    of its standard errors, and 0; that alone unless the estimate is significantly positive. If noise is correlated,
+    third differences of readings COMPARED_LAG apart are larger than those of neighbours. A changing pressure has slow
+    differences too, but not in most traces, so the median over traces is used. Shapes: traces (n_readings,).
     """
     ratios, counts = [], []
     for readings_Pa in traces:
@@ -326,18 +326,15 @@ def noise_correlation(traces: Sequence[Floats]) -> float:
             ratios.append(math.log(distant_variance / neighbour_sigma**2))
             counts.append(readings_Pa.size)
     if not ratios:
-        return 0.0
+        return [0.0]
+    sigma, ratio = math.sqrt(4 / NOISE_DEGREES * COMPARED_LAG / sum(counts)), float(np.median(ratios))
     # 3.0: standard deviations from which the noise of distant readings shows a correlation (chosen)
-    threshold = 3.0 * math.sqrt(4 / NOISE_DEGREES * COMPARED_LAG / sum(counts))
-    ratio = float(np.median(ratios))
-    if ratio < threshold:
-        return 0.0
+    if ratio < 3.0 * sigma:
+        return [0.0]
     rhos = np.linspace(0.0, 0.97, 98)
-    return float(
-        np.interp(
-            ratio, np.log(_third_difference_variance(rhos**COMPARED_LAG) / _third_difference_variance(rhos)), rhos
-        )
-    )
+    told = np.log(_third_difference_variance(rhos**COMPARED_LAG) / _third_difference_variance(rhos))
+    nearby = sigma * np.array([0.0, -0.5, 0.5, -1.0, 1.0, -1.5, 1.5, -2.0, 2.0])
+    return [*np.interp(ratio + nearby, told, rhos).tolist(), 0.0]
 
 
 def _third_difference_variance(rho: Floats) -> Floats:
@@ -563,8 +560,8 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
             growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
     raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
     read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
-    correlation = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
-    noises = [noise_of_traces(read, rho) for rho in dict.fromkeys((0.0, correlation))]
+    correlations = noise_correlations([readings.values_Pa for readings in read if not readings.all_noise])
+    noises = [noise_of_traces(read, rho) for rho in correlations]
     noisy = [k for k, of_trace in enumerate(zip(*noises, strict=True)) if min(each.sigma_Pa for each in of_trace) > 0]
     if not noisy:
         return denoised
@@ -573,12 +570,17 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
         [Recorded(read[k], raw[places[k]].time_s.size, of_all[k], growths[places[k]]) for k in noisy]
         for of_all in noises
     ]
-    # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides.
-    curves = max(map(Curves, recorded), key=lambda each: each.log_likelihood)
-    good = [trace for trace, excess in zip(curves.traces, curves.excess, strict=True) if excess <= 1]
-    of_good = iter(Curves(good).all() if 0 < len(good) < len(noisy) else curves.all())
-    for k, trace, excess in zip(noisy, curves.traces, curves.excess, strict=True):
-        denoised[places[k]] = DenoisedTrace(raw[places[k]].time_s, *(next(of_good) if excess <= 1 else _splined(trace)))
+    # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides, that of
+    # traces which curves explain.
+    clock = gauge_clock(recorded[0])
+    excess = Curves(recorded[0], clock).excess
+    telling = np.flatnonzero((excess <= 1) | (excess.min() > 1)).tolist()
+    possible = (Curves([of_all[k] for k in telling], clock) for of_all in recorded)
+    curves = max(possible, key=lambda each: each.log_likelihood)
+    smooth = {k: curve for k, curve, excess in zip(telling, curves.all(), curves.excess, strict=True) if excess <= 1}
+    for k, trace in enumerate(recorded[0]):
+        i = places[noisy[k]]
+        denoised[i] = DenoisedTrace(raw[i].time_s, *(smooth[k] if k in smooth else _splined(trace, clock)))
     return denoised
 
 
@@ -587,9 +589,9 @@ class Curves:
     curves integrated out; `excess` is what they leave, in units of what noise may leave.
     """
 
-    def __init__(self, traces: Sequence[Recorded]) -> None:
+    def __init__(self, traces: Sequence[Recorded], clock: tuple[float, float]) -> None:
         self.traces = traces
-        self.clock_s, self.clock_sigma_s = gauge_clock(traces)
+        self.clock_s, self.clock_sigma_s = clock
         self.factors = np.array([trace.equations(self.clock_s) for trace in traces])
         products, self.found = curves_of(self.factors, *kinds_of_curves())
         information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
@@ -624,7 +626,7 @@ class Curves:
             yield pressure_Pa, float(np.linalg.norm(means_Pa)), _principal_errors(errors_Pa - means_Pa, least_Pa)
 
 
-def _splined(trace: Recorded) -> tuple[Floats, float, Floats]:
+def _splined(trace: Recorded, clock: tuple[float, float]) -> tuple[Floats, float, Floats]:
     """A trace that no smooth function explains, by a smoothing spline through its readings, with knots where the
     pressure bends (Dierckx, IMA J. Numer. Anal. 1, 267, 1981); of fewer than five readings lines. Its errors are those
     of the curve through it alone, as much larger as that leaves more than noise.
@@ -638,7 +640,7 @@ def _splined(trace: Recorded) -> tuple[Floats, float, Floats]:
     few = places.size < 5
     weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
     spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
-    alone = Curves([trace])
+    alone = Curves([trace], clock)
     ((_, mean_error_Pa, errors_Pa),) = alone.all()
     larger = math.sqrt(max(float(alone.excess[0]), 1.0))
     return np.asarray(spline(np.arange(float(trace.count)))), mean_error_Pa, larger * errors_Pa

@@ -47,16 +47,6 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     return matrices
 
 
-def all_products(
-    columns: Sequence[Floats],
-    first: Sequence[NDArray[np.bool_]],
-    relative_sd: Sequence[Floats | None] | None = None,
-) -> Floats:
-    """`products` of every trial. Shapes: columns (n_points, k) → (n_trials, 3, k, k)."""
-    relative = [None] * len(columns) if relative_sd is None else relative_sd
-    return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
-
-
 @np.errstate(over="ignore", invalid="ignore")
 def at_correlation(cross_products: Floats, rho: float) -> Floats:
     """Whitened cross products at a given correlation, for innovations of variance 1. Shapes: cross_products (n_trials,

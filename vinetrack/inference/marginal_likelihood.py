@@ -198,6 +198,12 @@ class MixedProblem:
     points: Floats
     stretches: Floats
     random: NDArray[np.bool_]
+    own_errors: int = 0  #: systematic errors of a trial alone, its unknowns after its effects, with priors N(0, 1)
+
+    @property
+    def n_effects(self) -> int:
+        """Unknowns of each trial alone."""
+        return N_TRIAL_EFFECTS + self.own_errors
 
     def of_trials(self, trials: slice | NDArray[np.int_] | list[int]) -> MixedProblem:
         """The problem of some of the trials, with all its parameters."""
@@ -215,9 +221,9 @@ class MixedProblem:
 
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
-    """Prior mean and precision of the trial effects. Returns centre, precision : arrays, shape (n_trials, 4)."""
+    """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
     n = problem.index.shape[0]
-    centre, precision = np.zeros((n, N_TRIAL_EFFECTS)), np.ones((n, N_TRIAL_EFFECTS))
+    centre, precision = np.zeros((n, problem.n_effects)), np.ones((n, problem.n_effects))
     centre[:, :2], precision[:, :2] = problem.release_origin_mean, problem.release_origin_precision
     precision[:, DEVIATION_COLUMNS] = (
         1 / np.maximum(trial_deviation_sd(problem, state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
@@ -308,18 +314,18 @@ def whitened_products(cross_products: Floats, state: FitState) -> Floats:
 
 def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
     """Whitened cross products of keys, residual and further columns with the trial effects integrated out. Shapes:
-    cross_products (n_trials, 3, k, k) → (n_trials, k − 4, k − 4).
+    cross_products (n_trials, 3, k, k) → (n_trials, k − n_effects, k − n_effects).
     """
-    white = at_prior_means(whitened_products(cross_products, state), problem, state, N_TRIAL_EFFECTS + n_keys)
+    white = at_prior_means(whitened_products(cross_products, state), problem, state, problem.n_effects + n_keys)
     return eliminated(white, trial_effect_prior(problem, state)[1])[0]
 
 
 def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
-    """Cross products with the residual taken at zero deviations of pressure and ln B instead of the current ones, and
-    with what the priors of release and origin add: their pull, and their penalty at the current values. Shapes: white
-    (n_trials, k, k) → (n_trials, k, k).
+    """Cross products with the residual taken at zero deviations of pressure and ln B, and errors of single trials,
+    instead of the current ones, and with what the priors of release and origin add: their pull, and their penalty at
+    the current values. Shapes: white (n_trials, k, k) → (n_trials, k, k).
     """
-    columns = list(DEVIATION_COLUMNS)
+    columns = list(range(PRESSURE, state.trial_effects.shape[1]))
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
     restored = white.copy()
@@ -350,9 +356,9 @@ def levenberg_marquardt_step(
     """
     precision = trial_effect_prior(problem, state)[1]
     white = _with_prior_gradient(cross_products, problem, state)
-    damped = precision + damping * (np.einsum("nkk->nk", white)[:, :N_TRIAL_EFFECTS] + precision)
+    damped = precision + damping * (np.einsum("nkk->nk", white)[:, : problem.n_effects] + precision)
     reduced, response = eliminated(white, damped)
-    of_keys = np.ascontiguousarray(white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:])
+    of_keys = np.ascontiguousarray(white[:, problem.n_effects :, problem.n_effects :])
     undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
     square = information + np.diag(damping * np.diag(undamped[0]))
     step, _ = bounded_solve(square, slope, problem, state.theta)
@@ -389,8 +395,8 @@ def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: F
     """
     white = whitened_products(cross_products, state)
     centre, precision = trial_effect_prior(problem, state)
-    white[:, :N_TRIAL_EFFECTS, -1] -= precision * (state.trial_effects - centre)
-    white[:, -1, :N_TRIAL_EFFECTS] = white[:, :N_TRIAL_EFFECTS, -1]
+    white[:, : problem.n_effects, -1] -= precision * (state.trial_effects - centre)
+    white[:, -1, : problem.n_effects] = white[:, : problem.n_effects, -1]
     return white
 
 
@@ -413,8 +419,9 @@ CORRELATIONS = np.concatenate([np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97]])
 
 @dataclass(frozen=True)
 class Marginal:
-    """Whitened cross products of each trial with release and origin eliminated. `blocks`, shape (n_trials, 2 + n_keys +
-    1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual taken at zero deviations.
+    """Whitened cross products of each trial with release, origin and its own errors eliminated. `blocks`, shape
+    (n_trials, 2 + n_keys + 1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual taken at zero
+    deviations.
     """
 
     blocks: Floats
@@ -422,14 +429,19 @@ class Marginal:
 
 
 def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> Marginal:
-    """Eliminate release and origin, and take the residual at zero deviations. Shapes: cross_products (n_trials, 3, k,
-    k).
+    """Eliminate release, origin and errors of single trials, and take the residual at zero deviations. Shapes:
+    cross_products (n_trials, 3, k, k).
     """
     white = at_prior_means(whitened_products(cross_products, state), problem, state, -1)
-    precision = problem.release_origin_precision
+    precision = np.pad(problem.release_origin_precision, ((0, 0), (0, problem.own_errors)), constant_values=1.0)
+    if problem.own_errors:  # The deviations stay: they come after what is eliminated.
+        own = np.r_[N_TRIAL_EFFECTS : problem.n_effects]
+        order = np.r_[:PRESSURE, own, PRESSURE:N_TRIAL_EFFECTS, problem.n_effects : white.shape[-1]]
+        white = white[:, order[:, None], order]
     log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
     log_alignment = np.sum(
-        np.linalg.slogdet(with_diagonal(white[:, :2, :2], precision))[1] - np.log(precision).sum(axis=1)
+        np.linalg.slogdet(with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision))[1]
+        - np.log(precision).sum(axis=1)
     )
     constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
     return Marginal(eliminated(white, precision)[0], constant)
@@ -534,7 +546,7 @@ def estimate_noise(
     centre, precision = trial_effect_prior(problem, state)
     precision_scaled = precision * state.variance[:, None]
     prior_gradient = precision_scaled * (state.trial_effects - centre)
-    columns = [*range(N_TRIAL_EFFECTS), cross_products.shape[-1] - 1]
+    columns = [*range(problem.n_effects), cross_products.shape[-1] - 1]
     scores, squares, degrees = noise_at_correlations(
         cross_products[:, :, columns][:, :, :, columns],
         precision_scaled,

@@ -31,7 +31,7 @@ from vinetrack.dynamics.simulate import (
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, ParameterMap
-from vinetrack.inference.gaussian_processes import all_products
+from vinetrack.inference.gaussian_processes import products
 
 # ------------------------------------------------------------------------------
 # Jobs of trajectories to simulate, as arrays: a fit needs a hundred at a time, thousands of times.
@@ -363,11 +363,8 @@ class Predictor:
         """Cross products of the columns of every trial under its noise, see `gaussian_processes`. Shapes: columns
         (n_points, k) → (n_trials, 3, k, k).
         """
-        return all_products(
-            columns,
-            [trial_data.first for trial_data in self.data],
-            [trial_data.relative_sd for trial_data in self.data],
-        )
+        of_trials = zip(columns, self.data, strict=True)
+        return np.stack([products(values, trial.first, trial.relative_sd) for values, trial in of_trials])
 
     def _perturbations(
         self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool, side: int

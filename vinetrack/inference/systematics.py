@@ -20,7 +20,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.marginal_likelihood import MixedProblem
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.sensitivity import ORIGIN, PRESSURE, Predictor, position_change
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor, position_change
 
 PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
 
@@ -39,32 +39,36 @@ class Systematics:
     """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
     payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
     columns only for those that affect it. `places`, shape (n_trials, n_columns), gives the error of each column, -1 for
-    none, and `sources`, shape (count,), where each error comes from.
+    none, and `sources`, shape (count,), where each error comes from. Those of one trial alone, `own`, are unknowns of
+    that trial like its effects, and are eliminated with them: a campaign has many of them.
     """
 
     columns: list[Floats]
     places: NDArray[np.int_]
     sources: Sequence[str]
+    own: list[Floats]
 
     @property
     def count(self) -> int:
-        """Number of errors."""
+        """Number of errors that trials share."""
         return len(self.sources)
 
-    def beside(self, columns: Sequence[Floats], sizes: Floats | None = None) -> list[Floats]:
-        """Columns of a fit with those of the errors before the residual, which is that at these sizes, by default zero.
-        Shapes: columns (n_points, k) → (n_points, k + n_columns); sizes (count,).
+    def beside(self, columns: Sequence[Floats]) -> list[Floats]:
+        """Columns of a fit with those of the errors: of single trials after their effects, of several before the
+        residual. Shapes: columns (n_points, k) → (n_points, k + n_own + n_columns).
         """
-        of_trials = np.append(np.zeros(self.count) if sizes is None else sizes, 0.0)[self.places]
+        n = N_TRIAL_EFFECTS
         return [
-            np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1] - systematic @ at])
-            for of_fit, systematic, at in zip(columns, self.columns, of_trials, strict=True)
+            np.column_stack([of_fit[:, :n], own, of_fit[:, n:-1], shared, of_fit[:, -1]])
+            for of_fit, own, shared in zip(columns, self.own, self.columns, strict=True)
         ]
 
     def among(self, problem: MixedProblem) -> MixedProblem:
-        """The problem of a fit with the errors as further parameters, each with a standard normal prior."""
+        """The problem of a fit with the errors as further unknowns, each with a standard normal prior."""
         places = np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)
-        return replace(with_unknowns(problem, self.count), index=np.column_stack([problem.index, places]))
+        extended = with_unknowns(problem, self.count)
+        own = problem.own_errors + self.own[0].shape[1]
+        return replace(extended, index=np.column_stack([problem.index, places]), own_errors=own)
 
 
 # By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
@@ -76,7 +80,6 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
     functions: dict[str, Callable[[Predictor, Solution], Displaced]] = {
         "payloads": _payload_errors,
         "set pressures": _set_pressure_errors,
-        "gauge": _gauge_errors,
         "film": _film_errors,
         "tracking": _tracker_errors,
         "lens": _lens_errors,
@@ -85,7 +88,7 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
     columns: list[list[Floats]] = [[np.zeros((each.time_s.size, 0))] for each in data]
     places: list[list[int]] = [[] for _ in data]
     errors: dict[tuple[str, Hashable, int], int] = {}
-    for source in sources:
+    for source in filter(functions.__contains__, sources):
         displaced = functions[source](predictor, solution)
         width = max((moved_m.shape[1] for _, moved_m in displaced.values()), default=0)
         for i, (nothing, *_) in enumerate(columns):
@@ -94,7 +97,8 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
             places[i] += own + [-1] * (width - len(own))
             columns[i].append(np.pad(moved_m, ((0, 0), (0, width - len(own)))))
     index = np.array(places, dtype=int).reshape(len(data), -1)
-    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors])
+    own = _gauge_errors(predictor, solution) if "gauge" in sources else [nothing for nothing, *_ in columns]
+    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors], own)
 
 
 def _changes_of(
@@ -157,18 +161,21 @@ def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
     }
 
 
-def _gauge_errors(predictor: Predictor, solution: Solution) -> Displaced:
-    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
+def _gauge_errors(predictor: Predictor, solution: Solution) -> list[Floats]:
+    """Displacement by the errors that gauge noise leaves in each recorded pressure, except that of its mean, which is
+    part of the fit, m; the same number for every trial, zero beyond its own. Shape (n_points, n_errors).
+    """
     misread = [
         (i, replace(each, trace=(each.trace[0], each.trace[1] + error_Pa)))
         for i, each in enumerate(predictor.data)
         if each.trace is not None and each.trace_errors_Pa is not None
         for error_Pa in each.trace_errors_Pa.T
     ]
-    of_trial: dict[int, list[Floats]] = {}
+    of_trial = [[np.zeros((each.time_s.size, 0))] for each in predictor.data]
     for i, change_m in _changes_of(predictor, solution, misread):
-        of_trial.setdefault(i, []).append(change_m)
-    return {i: (i, np.hstack(changes_m)) for i, changes_m in of_trial.items()}
+        of_trial[i].append(change_m)
+    width = max(map(len, of_trial)) - 1
+    return [np.pad(np.hstack(moved_m), ((0, 0), (0, width + 1 - len(moved_m)))) for moved_m in of_trial]
 
 
 def _lens_errors(predictor: Predictor, solution: Solution) -> Displaced:
