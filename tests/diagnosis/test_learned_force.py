@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from grown import FORCES, effect_file, grown, hidden_force, pairs_of, sheet
+from hidden import make
 from scipy.interpolate import BSpline
 from scipy.stats import multivariate_normal
 
@@ -167,6 +168,13 @@ def test_a_rough_patch_is_learned_where_it_is_in_every_condition_and_is_no_simpl
         lowest = one.loc[one["force_N"].idxmin()]
         assert 0.12 < lowest["lead_position_m"] < 0.15
         assert -0.6 < lowest["force_N"] - one["force_N"].median() < -0.3
+
+
+@pytest.mark.slow
+def test_nothing_is_learned_about_tracks_along_which_the_model_is_unstable():
+    """Two of forty trials would move by 10^6 times their growth if their pressures deviated as usual."""
+    fit = vt.fit(vt.base_model(), list(make("outsider:squeeze", 40001).pairs), profile=False)
+    assert missing_force(fit).learned is None
 
 
 @pytest.mark.slow

@@ -415,8 +415,10 @@ class ForceEquations:
         grown_m = trial_data.lead_position_m - effects[ORIGIN]
         residual_m = grown_m - position_m - sensitivities[:, -1]
         columns = np.column_stack([-velocity_m_s, np.ones_like(grown_m), sensitivities[:, :-1], residual_m])
-        ended = np.flatnonzero(grown_m > MOST_OF_LENGTH * trial_data.trial.length_m)
-        used = slice(0, int(ended[0]) if ended.size else None)
+        # Where a usual deviation would move a trial by more than it travels, no small force can be told.
+        moved_m = np.max(np.abs(sensitivities[:, :2] * self.problem.state.spread), axis=1)
+        ended = (grown_m > MOST_OF_LENGTH * trial_data.trial.length_m) | (moved_m > np.ptp(grown_m))
+        used = slice(0, int(np.argmax(ended)) if ended.any() else None)
         relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
         return products(columns[used], trial_data.first[used], relative_sd)
 
