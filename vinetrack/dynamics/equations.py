@@ -220,8 +220,8 @@ def _collocation_polynomial(s, stages):
 
 
 @inlined
-def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
-    """Newton step of the stage speeds: (I − h A J) d = h A f − z, J the derivatives ∂a/∂v."""
+def _newton_step(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
+    """Newton step of the increments z at the stages: (I − h A J) d = h A f − z, J the derivatives of the rates f."""
     return _solve3(
         1 - h * A[0][0] * j1, -h * A[0][1] * j2, -h * A[0][2] * j3,
         -h * A[1][0] * j1, 1 - h * A[1][1] * j2, -h * A[1][2] * j3,
@@ -229,19 +229,6 @@ def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
         h * (A[0][0] * f1 + A[0][1] * f2 + A[0][2] * f3) - z1,
         h * (A[1][0] * f1 + A[1][1] * f2 + A[1][2] * f3) - z2,
         h * (A[2][0] * f1 + A[2][1] * f2 + A[2][2] * f3) - z3,
-    )  # fmt: skip
-
-
-@inlined
-def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
-    """Newton step of the chamber pressures at the stages; jc is h times the derivative of the rate."""
-    return _solve3(
-        1 - A[0][0] * jc, -A[0][1] * jc, -A[0][2] * jc,
-        -A[1][0] * jc, 1 - A[1][1] * jc, -A[1][2] * jc,
-        -A[2][0] * jc, -A[2][1] * jc, 1 - A[2][2] * jc,
-        h * (A[0][0] * g1 + A[0][1] * g2 + A[0][2] * g3) - (q1 - chamber),
-        h * (A[1][0] * g1 + A[1][1] * g2 + A[1][2] * g3) - (q2 - chamber),
-        h * (A[2][0] * g1 + A[2][1] * g2 + A[2][2] * g3) - (q3 - chamber),
     )  # fmt: skip
 
 
@@ -299,14 +286,14 @@ def radau_step(equations, trial, point, stages, scale, rtol):
             elif k == 5:
                 j3 = (f - f3) / delta
             else:
-                jc = h * (g - g3) / delta
+                jc = (g - g3) / delta
         jacobian_current = True
         change = 0.0
         if chamber_active:
-            c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)
+            c1, c2, c3 = _newton_step(h, jc, jc, jc, g1, g2, g3, q1 - chamber, q2 - chamber, q3 - chamber)
             q1, q2, q3 = q1 + c1, q2 + c2, q3 + c3
             change = max(abs(c1), abs(c2), abs(c3)) / (abs(q3) + 1e3)
-        d1, d2, d3 = _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
+        d1, d2, d3 = _newton_step(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
         z1, z2, z3 = z1 + d1, z2 + d2, z3 + d3
         size = max(abs(d1), abs(d2), abs(d3), change * scale)
         if not size < 1e300:
