@@ -274,8 +274,8 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """As `simulate.prepare`, for trials whose inputs are numbers already. Shapes: inputs (n_trials, n_fields of
-    `TrialInputs`); stamps (n_times,); starts (n_trials + 1,).
+    """Lay out trials for the compiled kernel. Shapes: inputs (n_trials, n_fields of `TrialInputs`); stamps (n_times,);
+    starts (n_trials + 1,).
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
