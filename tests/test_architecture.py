@@ -26,9 +26,9 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (693, 4, 5),
-    "core": (956, 7, 26),
+    "core": (948, 7, 25),
     "diagnosis": (6066, 14, 90),
-    "dynamics": (2318, 8, 26),
+    "dynamics": (2277, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 34),
@@ -40,9 +40,9 @@ BUDGETS = {
     "pages": (2870, 8, 22),
     "paper": (891, 4, 35),
     "pipeline": (1999, 7, 6),
-    "planning": (1586, 5, 24),
+    "planning": (1583, 4, 24),
     "report": (850, 3, 6),
-    "results": (485, 4, 10),
+    "results": (485, 4, 9),
     "tracks": (1487, 4, 20),
     "video": (5317, 17, 79),
 }

@@ -123,11 +123,13 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.experiment.settings import run_settings
     from vinetrack.pipeline.model_stage import diagnosed, write_diagnosis
     from vinetrack.pipeline.workflow import find_experiment
-    from vinetrack.results.folder_layout import Results, read_json, read_source_experiment
+    from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_source_experiment
 
     results = Results(target)
     if results.provenance.exists():
-        diagnosis, pairs = diagnosed(read_source_experiment(target, experiment), results, report)
+        source = read_source_experiment(target, experiment)
+        pairs, _ = measured_trials(source, results)
+        diagnosis = diagnosed(source, results, pairs, report)
         if json is None:
             write_diagnosis(results, diagnosis, pairs, run_settings(read_json(results.provenance)["settings"]))
         return [str(diagnosis)], diagnosis.to_json()

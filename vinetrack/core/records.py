@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
+from vinetrack.core.units import AMBIENT_PRESSURE_PA
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -97,7 +97,7 @@ class Trial:
     chamber_m3: float = math.nan
     inlet_m: float = math.nan
     bends: tuple[Bend, ...] = ()
-    film_density_kg_m3: float = FILM_DENSITY_KG_M3
+    film_density_kg_m3: float = 1200.0  #: thermoplastic polyurethane, 1100 to 1250 (chosen)
     m_per_px: float = math.nan
     travel_ratio: float = 2.0
     steady_window_s: tuple[float, float] | None = None

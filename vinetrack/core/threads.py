@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -22,12 +21,6 @@ def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    with threadpool_limits(1, user_api="blas"):
-        yield
-
-
 # Decorates a function so that linear algebra in it uses one thread; afterwards as many as before. The matrices of a
 # fit are too small to be shared out: threads that wait for each other cost processor time.
-in_one_blas_thread = _one_blas_thread()
+in_one_blas_thread = threadpool_limits.wrap(1, user_api="blas")

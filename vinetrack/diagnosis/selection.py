@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -46,6 +47,7 @@ from vinetrack.diagnosis.misfit_tests import (
     plausible_range,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
+from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
@@ -130,7 +132,7 @@ class Search:
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = [known for known in self.of_size(len(effects) + 1) if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
-            model = tests.fit.model.with_effects((shape.effect,))
+            model = tests.fit.model + shape.effect
             near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
             fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best, once=near)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
@@ -167,7 +169,7 @@ class Search:
     def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
         """Keep a set that is fitted from another one, unless no fit succeeds."""
         with suppress(FitError, SimulationError, np.linalg.LinAlgError):
-            after = refit(fit, self.before.model.with_effects(effects))
+            after = refit(fit, reduce(Model.__add__, effects, self.before.model))
             self._keep_best(likelihood_ratio(self.before, effects, after))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:

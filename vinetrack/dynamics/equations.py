@@ -178,19 +178,6 @@ NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)  # For a step without a previous one: aft
 
 
 @inlined
-def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
-    """Solve three linear equations by Cramer's rule: the Newton step of the three stages."""
-    k1 = m22 * m33 - m23 * m32
-    k2 = m23 * m31 - m21 * m33
-    k3 = m21 * m32 - m22 * m31
-    scale = 1 / (m11 * k1 + m12 * k2 + m13 * k3)
-    z1 = (b1 * k1 + m12 * (m23 * b3 - b2 * m33) + m13 * (b2 * m32 - m22 * b3)) * scale
-    z2 = (m11 * (b2 * m33 - m23 * b3) + b1 * k2 + m13 * (m21 * b3 - b2 * m31)) * scale
-    z3 = (m11 * (m22 * b3 - b2 * m32) + m12 * (b2 * m31 - m21 * b3) + b1 * k3) * scale
-    return z1, z2, z3
-
-
-@inlined
 def starting_values(point, h, previous):
     """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated. Without a
     previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the speed at
@@ -220,29 +207,24 @@ def _collocation_polynomial(s, stages):
 
 
 @inlined
-def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
-    """Newton step of the stage speeds: (I − h A J) d = h A f − z, J the derivatives ∂a/∂v."""
-    return _solve3(
-        1 - h * A[0][0] * j1, -h * A[0][1] * j2, -h * A[0][2] * j3,
-        -h * A[1][0] * j1, 1 - h * A[1][1] * j2, -h * A[1][2] * j3,
-        -h * A[2][0] * j1, -h * A[2][1] * j2, 1 - h * A[2][2] * j3,
-        h * (A[0][0] * f1 + A[0][1] * f2 + A[0][2] * f3) - z1,
-        h * (A[1][0] * f1 + A[1][1] * f2 + A[1][2] * f3) - z2,
-        h * (A[2][0] * f1 + A[2][1] * f2 + A[2][2] * f3) - z3,
-    )  # fmt: skip
-
-
-@inlined
-def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
-    """Newton step of the chamber pressures at the stages; jc is h times the derivative of the rate."""
-    return _solve3(
-        1 - A[0][0] * jc, -A[0][1] * jc, -A[0][2] * jc,
-        -A[1][0] * jc, 1 - A[1][1] * jc, -A[1][2] * jc,
-        -A[2][0] * jc, -A[2][1] * jc, 1 - A[2][2] * jc,
-        h * (A[0][0] * g1 + A[0][1] * g2 + A[0][2] * g3) - (q1 - chamber),
-        h * (A[1][0] * g1 + A[1][1] * g2 + A[1][2] * g3) - (q2 - chamber),
-        h * (A[2][0] * g1 + A[2][1] * g2 + A[2][2] * g3) - (q3 - chamber),
-    )  # fmt: skip
+def _newton_step(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
+    """Newton step of the increments z at the stages, by Cramer's rule: (I − h A J) d = h A f − z, J the derivatives of
+    the rates f.
+    """
+    m11, m12, m13 = 1 - h * A[0][0] * j1, -h * A[0][1] * j2, -h * A[0][2] * j3
+    m21, m22, m23 = -h * A[1][0] * j1, 1 - h * A[1][1] * j2, -h * A[1][2] * j3
+    m31, m32, m33 = -h * A[2][0] * j1, -h * A[2][1] * j2, 1 - h * A[2][2] * j3
+    b1 = h * (A[0][0] * f1 + A[0][1] * f2 + A[0][2] * f3) - z1
+    b2 = h * (A[1][0] * f1 + A[1][1] * f2 + A[1][2] * f3) - z2
+    b3 = h * (A[2][0] * f1 + A[2][1] * f2 + A[2][2] * f3) - z3
+    k1 = m22 * m33 - m23 * m32
+    k2 = m23 * m31 - m21 * m33
+    k3 = m21 * m32 - m22 * m31
+    scale = 1 / (m11 * k1 + m12 * k2 + m13 * k3)
+    d1 = (b1 * k1 + m12 * (m23 * b3 - b2 * m33) + m13 * (b2 * m32 - m22 * b3)) * scale
+    d2 = (m11 * (b2 * m33 - m23 * b3) + b1 * k2 + m13 * (m21 * b3 - b2 * m31)) * scale
+    d3 = (m11 * (m22 * b3 - b2 * m32) + m12 * (b2 * m31 - m21 * b3) + b1 * k3) * scale
+    return d1, d2, d3
 
 
 @inlined
@@ -299,14 +281,14 @@ def radau_step(equations, trial, point, stages, scale, rtol):
             elif k == 5:
                 j3 = (f - f3) / delta
             else:
-                jc = h * (g - g3) / delta
+                jc = (g - g3) / delta
         jacobian_current = True
         change = 0.0
         if chamber_active:
-            c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)
+            c1, c2, c3 = _newton_step(h, jc, jc, jc, g1, g2, g3, q1 - chamber, q2 - chamber, q3 - chamber)
             q1, q2, q3 = q1 + c1, q2 + c2, q3 + c3
             change = max(abs(c1), abs(c2), abs(c3)) / (abs(q3) + 1e3)
-        d1, d2, d3 = _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
+        d1, d2, d3 = _newton_step(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
         z1, z2, z3 = z1 + d1, z2 + d2, z3 + d3
         size = max(abs(d1), abs(d2), abs(d3), change * scale)
         if not size < 1e300:

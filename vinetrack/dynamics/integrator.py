@@ -81,10 +81,12 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 if row == count:
                     return STALLED, point.time, 0.0, n_steps, slack_time
                 point = Point(start, point.x, 0.0, 0.0, chamber)
-            if trial.inputs[FREE] > 0 and _slack_at_rest(equations, trial, point.time, point.x, point.chamber):
-                point = Point(point.time, point.x, 0.0, 0.0, point.chamber)
-                phase = slack
-                continue
+            if trial.inputs[FREE] > 0:
+                tension, _rate = _ask(equations, Asked.REST_TENSION, point.time, point.x, 0.0, point.chamber, trial)
+                if tension < 0:
+                    point = Point(point.time, point.x, 0.0, 0.0, point.chamber)
+                    phase = slack
+                    continue
             point, speed_scale, h = _start_from_rest(equations, trial, point, last_time, stop)
             phase, previous_stages = moving, NO_STAGES
         while next_breakpoint < breakpoints.size and point.x >= breakpoints[next_breakpoint]:
@@ -382,13 +384,6 @@ class SlackState(NamedTuple):
     v: float
     y: float
     chamber: float
-
-
-@compiled
-def _slack_at_rest(equations, trial, time, x, chamber):
-    """Whether the tail of a vine at rest would be under compression."""
-    tension, _rate = _ask(equations, Asked.REST_TENSION, time, x, 0.0, chamber, trial)
-    return tension < 0
 
 
 @compiled

@@ -11,7 +11,6 @@ import atexit
 import hashlib
 import importlib.util
 import inspect
-import itertools
 import math
 import os
 import shutil
@@ -275,8 +274,8 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """As `simulate.prepare`, for trials whose inputs are numbers already. Shapes: inputs (n_trials, n_fields of
-    `TrialInputs`); stamps (n_times,); starts (n_trials + 1,).
+    """Lay out trials for the compiled kernel. Shapes: inputs (n_trials, n_fields of `TrialInputs`); stamps (n_times,);
+    starts (n_trials + 1,).
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
@@ -289,17 +288,17 @@ def lay_out(
     else:
         on = effects_on(model, thetas)
     breakpoints, stops = _limits(model, inputs, thetas, on, bends)
-    rows = [stamps[a:b] for a, b in itertools.pairwise(starts.tolist())]
     samples = [np.empty(0) if trace is None else trace[0] for trace in traces] if traces else [np.empty(0)] * count
     pressures = [trace[1] for trace in traces or () if trace is not None]
+    sampled, trace_starts = np.concatenate([np.empty(0), *(samples if traces else ())]), starts_of(samples)
     arrays = BatchArrays(
         starts=starts,
-        times=np.concatenate([np.empty(0), *_true_times(model, "true_time", inputs, thetas, on, rows)]),
+        times=_true_times(model, "true_time", inputs, thetas, on, stamps, starts),
         on=on,
         inputs=inputs,
         thetas=thetas,
-        trace_starts=starts_of(samples),
-        trace_time=np.concatenate([np.empty(0), *_true_times(model, "trace_time", inputs, thetas, on, samples)]),
+        trace_starts=trace_starts,
+        trace_time=_true_times(model, "trace_time", inputs, thetas, on, sampled, trace_starts),
         trace_pressure=np.concatenate([np.empty(0), *pressures]),
         bend_starts=starts_of(bends),
         bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
@@ -312,7 +311,7 @@ def lay_out(
 def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
     """Start of each part in their concatenation, and the end of the last. Shape (n_parts + 1,)."""
     starts = np.zeros(len(parts) + 1, dtype=np.int64)
-    np.cumsum([len(part) for part in parts], out=starts[1:])
+    np.cumsum(np.fromiter(map(len, parts), np.int64, len(parts)), out=starts[1:])
     return starts
 
 
@@ -361,13 +360,13 @@ def _limits(
 
 
 def _true_times(
-    model: Model, hook: str, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Sequence[Floats]
-) -> list[Floats]:
-    """True times since release of each trial's stamps, by the effects on the clock that stamped them."""
-    true_times = list(stamps)
+    model: Model, hook: str, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats,
+    starts: NDArray[np.int64],
+) -> Floats:  # fmt: skip
+    """True times since release of the stamps of all trials, by the effects on the clock that stamped them."""
+    true_times = stamps.copy()
     for effect, function, place in model.hooks[hook]:
-        for i in np.flatnonzero(on[:, effect]).tolist():
-            if len(true_times[i]):
-                state = _NOTHING._replace(time=true_times[i])  # type: ignore[arg-type]
-                true_times[i] = np.asarray(function(state, TrialInputs(*inputs[i]), *thetas[i, place]), dtype=float)
+        for i in np.flatnonzero(on[:, effect] & (np.diff(starts) > 0)).tolist():
+            own = true_times[starts[i] : starts[i + 1]]
+            own[:] = function(_NOTHING._replace(time=own), TrialInputs(*inputs[i]), *thetas[i, place])  # type: ignore[arg-type]
     return true_times

@@ -119,10 +119,6 @@ class Model(Printed):
         effect = find_effect(other, self.user_effects) if isinstance(other, str) else other
         return replace(self, effects=(*self.effects, effect))
 
-    def with_effects(self, effects: Iterable[Effect]) -> Model:
-        """The model with these effects added one after the other."""
-        return replace(self, effects=(*self.effects, *effects))
-
     def __sub__(self, other: Effect | str) -> Model:
         name = other if isinstance(other, str) else other.name
         if name not in self.names:

@@ -96,7 +96,16 @@ def simulate_many(
     """Simulate many trials in one call of the compiled kernel, see `simulate`. Shapes: parameters (n_trials,
     n_parameters).
     """
-    batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
+    check_needs(model, *trials)
+    inputs = np.array([TrialInputs.of(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
+    if parameters is None:
+        groups = [(trial.vine, trial.group("day")) for trial in trials]
+        of_group = {group: model.parameters_for(*group) for group in set(groups)}
+        parameters = np.array([of_group[group] for group in groups])
+    bends = [bends_of(trial) for trial in trials]
+    given = [np.asarray(t, dtype=float) for t in times_s]
+    stamps = np.concatenate([np.empty(0), *given])
+    batch = lay_out(model, inputs, bends, stamps, starts_of(given), traces=traces, parameters=parameters, host=host)
     out, ends = batch.run(relative_tolerance)
     check_completed(ends, [trial.name for trial in trials])
     return trajectories(batch, out, ends, [trial.travel_ratio for trial in trials])
@@ -133,28 +142,6 @@ def check_completed(ends: Floats, names: Sequence[str]) -> None:
     if failed.size:
         end_s = float(ends[failed[0], 1])
         raise SimulationError(f"Trial {names[failed[0]]}: the model could not be integrated beyond {end_s:.6g} s.")
-
-
-def prepare(
-    model: Model,
-    trials: Sequence[Trial],
-    times_s: Sequence[Floats],
-    *,
-    traces: Sequence[Trace | None] | None = None,
-    parameters: Floats | None = None,
-    host: Model | None = None,
-) -> Batch:
-    """Lay out trials for the compiled kernel."""
-    check_needs(model, *trials)
-    inputs = np.array([TrialInputs.of(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
-    if parameters is None:
-        groups = [(trial.vine, trial.group("day")) for trial in trials]
-        of_group = {group: model.parameters_for(*group) for group in set(groups)}
-        parameters = np.array([of_group[group] for group in groups])
-    bends = [bends_of(trial) for trial in trials]
-    given = [np.asarray(t, dtype=float) for t in times_s]
-    stamps = np.concatenate(given) if given else np.empty(0)
-    return lay_out(model, inputs, bends, stamps, starts_of(given), traces=traces, parameters=parameters, host=host)
 
 
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:

@@ -225,11 +225,7 @@ REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure
 _RECORDING_COLUMNS = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
 
 
-def planned_trial(
-    values: Mapping[str, str],
-    settings: ExperimentSettings | None = None,
-    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
-) -> Experiment:
+def planned_trial(values: Mapping[str, str], needed: Sequence[str] = REQUIRED_FOR_PREDICTION) -> Experiment:
     """Read a trial from texts by name of column, as given on the command line.
 
     A yield pressure that is not given is NaN. Messages name the command-line option.
@@ -237,7 +233,6 @@ def planned_trial(
     Parameters
     ----------
     values : texts by column, in the unit of the column.
-    settings : shared settings; None for the defaults.
     needed : required columns.
 
     Returns
@@ -256,7 +251,7 @@ def planned_trial(
     '24mm-200um-280mm'
     """
     table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
-    return planned_rows(table, settings or ExperimentSettings(), needed)
+    return planned_rows(table, ExperimentSettings(), needed)
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> Experiment:

@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from vinetrack import effects
 from vinetrack.core.records import Floats, Trial, plain_track
-from vinetrack.core.units import AIR_DENSITY_KG_M3, AMBIENT_PRESSURE_PA
+from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
@@ -27,6 +26,7 @@ from vinetrack.kinematics.force import paper_force_N
 from vinetrack.kinematics.steady import paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
 from vinetrack.paper import published
+from vinetrack.planning.prediction import gauge_left
 from vinetrack.planning.predictive_inputs import damping_prior
 
 
@@ -38,12 +38,6 @@ def area_m2(diameter_mm: float) -> float:
 def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> float:
     """Return the volume of a whole vine over that of its chamber."""
     return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
-
-
-def gauge_left(gauge_Pa: float, change: Any, gamma: float = 1.0) -> Any:
-    """Fraction of the gauge pressure left after the volume has grown by `change`: P_abs V^γ is constant."""
-    absolute_Pa = gauge_Pa + AMBIENT_PRESSURE_PA
-    return (absolute_Pa * (1 + change) ** -gamma - AMBIENT_PRESSURE_PA) / gauge_Pa
 
 
 # Fraction of the length up to which positions are compared (chosen)

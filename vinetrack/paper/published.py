@@ -4,8 +4,15 @@ where they are used.
 
 from __future__ import annotations
 
-from vinetrack.planning.printed_law import *  # noqa: F403
-from vinetrack.planning.printed_law import DIAMETER_MM, THICKNESS_UM
+from vinetrack.planning.predictive_inputs import (  # noqa: F401
+    DAMPING_B,
+    DAMPING_R2,
+    DIAMETER_MM,
+    SOURCE,
+    THICKNESS_UM,
+    YIELD_PRESSURE_KPA,
+)
+from vinetrack.planning.predictive_inputs import PRINTED_EXPONENT as EXPONENT  # noqa: F401
 
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03  # Definition of a steady window (published)
 CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)

@@ -29,12 +29,12 @@ from vinetrack.paper.motions import (
     area_m2,
     comparison_tables,
     drag_shares,
-    gauge_left,
     rule_on_noise_free,
     speeds_at,
     volume_change,
 )
 from vinetrack.paper.published import SOURCE
+from vinetrack.planning.prediction import gauge_left
 from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
 
 COMPUTED = "computed"

@@ -66,11 +66,11 @@ def fit_and_diagnose(job: Job) -> list[str]:
     """
     lines, results = fit_damping(job), Results(job.results)
     job.say("fitting the model")
-    fitted = fit_model(job)
+    fitted, pairs = fit_model(job)
     try:
-        diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
+        diagnosis = diagnosed(job.experiment, results, pairs, job.say, fitted)
     except Exception as error:
-        reason, pairs = _reason(error), ()
+        reason = _reason(error)
         explanation = f"No diagnosis could be made: {reason}"
         diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
@@ -79,8 +79,8 @@ def fit_and_diagnose(job: Job) -> list[str]:
     return [*lines, str(diagnosis)]
 
 
-def fit_model(job: Job) -> Fit | None:
-    """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis."""
+def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
+    """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis, with its trials."""
     experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)
@@ -111,7 +111,7 @@ def fit_model(job: Job) -> Fit | None:
         write_csv(results.trajectories(condition), table)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
-    return initial
+    return initial, pairs
 
 
 def _emptied(folder: Path) -> Path:
@@ -150,15 +150,13 @@ Report = Callable[[str], None]
 
 
 def diagnosed(
-    experiment: Experiment, results: Results, report: Report, fitted: Fit | None = None
-) -> tuple[Diagnosis, Pairs]:
-    """The diagnosis as the experiment asks for it, with what contradicts its sheet; and its trials."""
+    experiment: Experiment, results: Results, pairs: Pairs, report: Report, fitted: Fit | None = None
+) -> Diagnosis:
+    """The diagnosis of these trials as the experiment asks for it, with what contradicts its sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
 
-    pairs, _ = measured_trials(experiment, results)
     tracks = {trial.name: track for trial, track in pairs}
-    diagnosis = diagnose(experiment, tracks=tracks, report=report, fitted=fitted)
-    return with_contradictions(diagnosis, results, pairs), pairs
+    return with_contradictions(diagnose(experiment, tracks=tracks, report=report, fitted=fitted), results, pairs)
 
 
 def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) -> Diagnosis:

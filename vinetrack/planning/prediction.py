@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
+from vinetrack.core.units import AMBIENT_PRESSURE_PA
 from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
@@ -460,11 +461,14 @@ def swept_m3(trial: Trial) -> float:
     return trial.area_m2 * trial.length_m
 
 
-def gauge_loss(trial: Trial, chamber_m3: float, gamma: float) -> float:
+def gauge_left(gauge_Pa: float, change: Any, gamma: float = 1.0, ambient_Pa: float = AMBIENT_PRESSURE_PA) -> Any:
+    """Fraction of the gauge pressure left after the volume has grown by `change`: P_abs V^γ is constant."""
+    return ((gauge_Pa + ambient_Pa) * (1 + change) ** -gamma - ambient_Pa) / gauge_Pa
+
+
+def gauge_loss(trial: Trial, chamber_m3: Any, gamma: float) -> Any:
     """Return the fraction of the gauge pressure that a closed chamber loses while a vine grows."""
-    pressure_Pa, ambient_Pa = trial.pressure_Pa, trial.ambient_pressure_Pa
-    left_Pa = (pressure_Pa + ambient_Pa) * (chamber_m3 / (chamber_m3 + swept_m3(trial))) ** gamma - ambient_Pa
-    return 1 - left_Pa / pressure_Pa
+    return 1 - gauge_left(trial.pressure_Pa, swept_m3(trial) / chamber_m3, gamma, trial.ambient_pressure_Pa)
 
 
 def chamber_for(trial: Trial, loss: float, gamma: float) -> float:

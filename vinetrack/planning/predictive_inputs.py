@@ -26,7 +26,6 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
-from vinetrack.planning import printed_law
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_summary import FitSummary
@@ -40,21 +39,29 @@ if TYPE_CHECKING:
 # t/D, so they do not determine the exponents of t and D separately: their split has an error of its own. None of these
 # values is a measurement, and every output that uses them says so.
 
+# Table I and the damping law of Alvarez et al., IEEE Robotics and Automation Letters, 2025, from which the priors are;
+# what else they print stands in `vinetrack.paper.published`
+SOURCE = "Alvarez et al. (2025)"
+DAMPING_B = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}  # Damping coefficient by scale R, N·(s/m)ⁿ
+DAMPING_R2 = {1: 0.964, 2: 0.981, 3: 0.896, 4: 0.971}  # R² of the power law at the steady points of each scale
+PRINTED_EXPONENT = 0.37  # Damping exponent n, one for all scales (published)
+THICKNESS_UM = {1: 50.0, 2: 100.0, 3: 150.0, 4: 200.0}
+DIAMETER_MM = {1: 6.0, 2: 12.0, 3: 18.0, 4: 24.0}  # The four isometric vines of Table I
+YIELD_PRESSURE_KPA = 3.0  # Yield pressure of the 24 mm × 200 µm vine, R = 4 (published)
+
 SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
 # Diameter and thickness, m, of the printed vines, by their scale R
-PRINTED_SIZES = {
-    R: (1e-3 * printed_law.DIAMETER_MM[R], 1e-6 * printed_law.THICKNESS_UM[R]) for R in printed_law.DAMPING_B
-}
+PRINTED_SIZES = {R: (1e-3 * DIAMETER_MM[R], 1e-6 * THICKNESS_UM[R]) for R in DAMPING_B}
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
     """The prior of B of a vine of this size, N·(s/m)ⁿ."""
     largest = max(PRINTED_SIZES)
     diameter, thickness = PRINTED_SIZES[largest]
-    return printed_law.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
+    return DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
 def prior_ratio(trial: Trial, like: Trial) -> float:
@@ -68,7 +75,7 @@ def damping_scatter() -> float:
     >>> round(damping_scatter(), 3)
     0.113
     """
-    residuals = [math.log(printed_law.DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
+    residuals = [math.log(DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
@@ -97,7 +104,7 @@ def exponent_sigma() -> float:
     0.012
     """
     dof = (8 + 11) / 2 - 2
-    variances = [printed_law.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in printed_law.DAMPING_R2.values()]
+    variances = [PRINTED_EXPONENT**2 * (1 - R2) / R2 / dof for R2 in DAMPING_R2.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
@@ -387,7 +394,7 @@ class _Assembly:
         elif place is None and self.printed_scale is not None:
             error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
             why = remark("B_printed", percent=100 * error)
-            self.set(DAMPING, printed_law.DAMPING_B[self.printed_scale], "printed", source=printed_law.SOURCE)
+            self.set(DAMPING, DAMPING_B[self.printed_scale], "printed", source=SOURCE)
             self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
             # The uncertainties are the scatter of the printed values about the prior, and the exponents of t against D.
@@ -421,7 +428,7 @@ class _Assembly:
             self.set_fitted(EXPONENT, place)
         else:
             error = exponent_sigma()
-            self.set(EXPONENT, printed_law.EXPONENT, "printed", source=printed_law.SOURCE)
+            self.set(EXPONENT, PRINTED_EXPONENT, "printed", source=SOURCE)
             self.vary(EXPONENT, error, "error of n", "n printed", remark("n_printed", error=error))
 
     def yield_pressure(self) -> None:
@@ -433,7 +440,7 @@ class _Assembly:
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
             place = place if abs(stated - fit.fit.numbers[place].value) <= max(tolerance, 1.0) else None
-        printed_kPa = printed_law.YIELD_PRESSURE_KPA
+        printed_kPa = YIELD_PRESSURE_KPA
         if place is not None:
             self.set_fitted(YIELD, place)
         elif math.isfinite(stated):
@@ -442,7 +449,7 @@ class _Assembly:
             self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
         elif self.printed_scale == 4:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
-            self.set(YIELD, 1000 * printed_kPa, "printed", source=printed_law.SOURCE)
+            self.set(YIELD, 1000 * printed_kPa, "printed", source=SOURCE)
             why = remark("P_y_printed", kPa=rounding_Pa / 1e3)
             self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
@@ -619,7 +626,7 @@ def _middle_ratio(pairs: Iterable[tuple[Trial, float]]) -> float:
     for trial, speed in pairs:
         if 0 < speed < math.inf:
             drive_N = max(0.0, (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2)
-            damping = drive_N / (trial.travel_ratio * speed) ** printed_law.EXPONENT
+            damping = drive_N / (trial.travel_ratio * speed) ** PRINTED_EXPONENT
             ratios.append(damping / damping_prior(trial.diameter_m, trial.thickness_m))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
     return float(np.median(known)) if known else math.nan

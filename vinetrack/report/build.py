@@ -116,7 +116,9 @@ def _as_webp(png: bytes, quality: int) -> str:
     picture = Image.open(io.BytesIO(png))
     is_opaque = picture.mode != "RGBA" or picture.getchannel("A").getextrema() == (255, 255)
     file = io.BytesIO()
-    picture.convert("RGB" if is_opaque else "RGBA").save(file, "WEBP", quality=quality, method=4)
+    picture.convert("RGB" if is_opaque else "RGBA").save(
+        file, "WEBP", quality=quality, method=2
+    )  # a tenth larger than 4 in half the time
     return base64_uri("image/webp", file.getvalue())
 
 

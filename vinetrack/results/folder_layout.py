@@ -53,7 +53,6 @@ TEXT_COLUMNS = frozenset({
     "term", "size", "note", "added", "parameter", "symbol", "unit", "against", "sentence", "row", "where",
     "quantity", "setting", "as_printed", "mark", "how", "beside", "figure", "departure", "method",
 })  # fmt: skip
-COUNT_COLUMNS = frozenset({"n_frames", "points"})
 TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative", "partial"})
 
 
@@ -169,7 +168,7 @@ def table_of(columns: Sequence[str], rows: Sequence[Mapping[str, Any]] = ()) -> 
     import pandas as pd
 
     kinds = {
-        column: "Int64" if column in COUNT_COLUMNS else "bool" if column in TRUTH_COLUMNS else "float"
+        column: "Int64" if column in ("n_frames", "points") else "bool" if column in TRUTH_COLUMNS else "float"
         for column in columns
         if column not in TEXT_COLUMNS
     }
