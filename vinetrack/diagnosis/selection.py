@@ -175,12 +175,11 @@ class Search:
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low, or not known."""
         for effect in hypothesis.effects:
-            sigmas, required = 0.0, SEARCH_SIGMAS
             self.report(f"taking out {effect.name}")
             others = [other for other in hypothesis.effects if other is not effect]
-            if (smaller := self.subset(hypothesis, others, again=True)) is not None:
-                sigmas = _worth(hypothesis, smaller, (effect,))
-                required = max(required, self.tests_after(smaller.fit).family[effect.name])
+            smaller = self.subset(hypothesis, others, again=True)
+            sigmas = 0.0 if smaller is None else _worth(hypothesis, smaller, (effect,))
+            required = self.tests_after((smaller or hypothesis).fit).family[effect.name]
             if sigmas < required:
                 return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
         return Remark()
@@ -438,7 +437,8 @@ def _effect_set_rounds(search: Search) -> list[SelectionStep]:
         of_this_size = search.grow(size)
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
-        adequate, rejected, after = adequate_hypotheses(of_this_size, search)
+        adequate, of_these, after = adequate_hypotheses(of_this_size, search)
+        rejected |= of_these
         if after is not None:
             if search.is_better(adequate[0]):
                 return _rounds(search, tuple(search.fitted.values()), adequate, rejected, after)
