@@ -105,7 +105,7 @@ def listed_names(names: Sequence[str], last: str = "and") -> str:
 
 def verdict_line(diagnosis: Diagnosis) -> str:
     """Return the verdict in one line, with the names of effects as commands take them."""
-    return f"{diagnosis.verdict}: {_told(diagnosis, str)}"
+    return f"{'check the sheet' if diagnosis.contradicted_columns else diagnosis.verdict}: {_told(diagnosis, str)}"
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
@@ -153,7 +153,7 @@ def verdict_table(diagnosis: Diagnosis) -> list[Row]:
 
 def _thereafter(diagnosis: Diagnosis) -> str:
     """What the model lacks once all that was found is in it; blank where that is the verdict itself."""
-    if not diagnosis.effects:
+    if not diagnosis.effects or diagnosis.contradicted_columns:
         return ""
     it = "it" if len(diagnosis.effects) == 1 else "them"
     last = diagnosis.rounds[-1]
