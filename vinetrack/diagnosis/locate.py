@@ -378,4 +378,6 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
         subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
         change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
-        yield _tested(subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated)
+        yield _tested(
+            subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated, pressure_unit=number.pressure_unit
+        )

@@ -591,7 +591,7 @@ def build_report(content: dict[str, Any]) -> str:
     }
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
-    in_templates = (rows, display_unit, bounds_text, listed_names, expected_text, model_errors, final_errors)
+    in_templates = (rows, bounds_text, listed_names, expected_text, model_errors, final_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
