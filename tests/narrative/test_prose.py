@@ -4,13 +4,16 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
+from vinetrack.diagnosis.locate import Failure
 from vinetrack.diagnosis.result import (
     PROBABILITIES,
     VERDICTS,
@@ -108,3 +111,10 @@ def test_a_fitted_pressure_and_what_pulls_it_are_told_in_the_unit_of_the_sheet()
     row |= {"change": 1.0, "change_sigma": 0.1, "z": 9.0}
     assert "1.00 ± 0.10 psi" in drift_text(row, 689.4757, "psi")
     assert "to 13.79 kPa" in drift_text(row, 689.4757)
+
+
+@pytest.mark.parametrize(("z", "count"), [(1.0, 1), (math.nan, 0)])
+def test_nothing_is_said_of_the_scatter_of_replicates_where_there_are_none(z, count):
+    row = {"pressure_Pa": 2e4, "payload_kg": 0.0, "vine": "a", "z": z, "rms_m": 1e-3}
+    failure = Failure("kPa", pd.DataFrame([row]), pd.DataFrame(), SimpleNamespace(remarks=()))
+    assert [one.code for one in failure.remarks()] == ["fails_nowhere"] * count

@@ -82,7 +82,7 @@ class Failure:
                 name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")
             }
             yield remark("fails_most", condition=condition, **numbers)
-        else:
+        elif math.isfinite(worst["z"]):  # not where nothing was repeated
             yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=condition)
         yield from self.drift.remarks
 
