@@ -41,7 +41,7 @@ BUDGETS = {
     "paper": (891, 4, 35),
     "pipeline": (1999, 7, 6),
     "planning": (1583, 4, 24),
-    "report": (850, 3, 6),
+    "report": (829, 3, 5),
     "results": (485, 4, 9),
     "tracks": (1487, 4, 20),
     "video": (5317, 17, 79),

@@ -4,13 +4,16 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
+from vinetrack.diagnosis.locate import Failure
 from vinetrack.diagnosis.result import (
     PROBABILITIES,
     VERDICTS,
@@ -21,9 +24,10 @@ from vinetrack.diagnosis.result import (
     Power,
     PowerInput,
 )
+from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import templates
-from vinetrack.narrative.diagnosis_text import REMARKS, further_lines
-from vinetrack.narrative.verdict_text import verdict_sentence
+from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines
+from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_sentence
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -95,3 +99,22 @@ def plan() -> str:
 def test_the_text_is_the_stored_one(make):
     stored = Path(__file__).with_name(f"{make.__name__}.txt")
     assert make() + "\n" == stored.read_text(encoding="utf-8"), f"if it is meant to be so, store it in {stored.name}"
+
+
+def test_a_fitted_pressure_and_what_pulls_it_are_told_in_the_unit_of_the_sheet():
+    stored = {"parameter": "yield_pressure.P_y", "vine": "", "symbol": "P_y", "unit": "Pa", "pressure_unit": "psi"}
+    pressure = Number.from_json(stored | {"value": 6894.757, "sigma": 68.94757, "low_95": 6756.86, "high_95": 7032.65})
+    assert estimate_text(pressure) == "P_y = 1.000 ± 0.010 psi (6.89 kPa)"
+    assert estimate_text(replace(pressure, pressure_unit="kPa")) == "P_y = 6.895 ± 0.069 kPa"
+    assert bounds_text(pressure, with_unit=True) == "0.9800 to 1.020 psi"
+    row = {"symbol": "P_y", "vine": "", "against": "sheet", "from_level": 6894.757, "to_level": 13789.514}
+    row |= {"change": 1.0, "change_sigma": 0.1, "z": 9.0}
+    assert "1.00 ± 0.10 psi" in drift_text(row, 689.4757, "psi")
+    assert "to 13.79 kPa" in drift_text(row, 689.4757)
+
+
+@pytest.mark.parametrize(("z", "count"), [(1.0, 1), (math.nan, 0)])
+def test_nothing_is_said_of_the_scatter_of_replicates_where_there_are_none(z, count):
+    row = {"pressure_Pa": 2e4, "payload_kg": 0.0, "vine": "a", "z": z, "rms_m": 1e-3}
+    failure = Failure("kPa", pd.DataFrame([row]), pd.DataFrame(), SimpleNamespace(remarks=()))
+    assert [one.code for one in failure.remarks()] == ["fails_nowhere"] * count

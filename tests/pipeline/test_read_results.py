@@ -224,7 +224,9 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
     for first in (str(contradicted).splitlines()[0], verdict_sentence(contradicted)):
         assert "diameter_mm and pressure_kPa" in first
         assert "reservoir" not in first
-    assert contradicted.explanation.endswith(made.explanation)
+    assert str(contradicted).startswith("check the sheet: ")
+    assert contradicted.explanation == verdict_sentence(contradicted)
+    assert contradicted.next_experiment is None
     write_json(results.diagnosis, contradicted.to_json())
     with pytest.raises(ResultsError, match="pressure_kPa"):
         propose_effect(None, tmp_path, None, print)

@@ -58,7 +58,7 @@ PROVENANCE = {
 
 def page(**changes: object) -> str:
     content = dict.fromkeys(("clip", "fit", "comparison", "check", "diagnosis"))
-    content |= {key: {} for key in ("motions", "strips", "flags", "calibrations", "clips", "effects")}
+    content |= {key: {} for key in ("pictures", "calibrations", "effects")}
     content |= {"name": "vines", "trials": trials("a"), "damping": damping("v")}
     content |= {"provenance": PROVENANCE, "figures": [], "sections": [], "notes": []}
     return build.build_report({**content, **changes})
@@ -98,7 +98,7 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
     section = {"key": "paper", "title": EVIL, "paragraphs": [EVIL], "tables": [table], "figures": []}
     figure = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)
     given = {"name": EVIL, "damping": fit, "provenance": PROVENANCE | written, "figures": [figure]}
-    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": CLIP | {"caption": EVIL}}
+    given |= {"pictures": {"a": {"clip": "overlays/a.mp4"}}, "clip": CLIP | {"caption": EVIL}}
     given |= result(messages=[EVIL], warnings=[EVIL]) | {"sections": [section]}
     for html in (page(trials=trials(EVIL, reason=EVIL)), page(damping=unfitted), page(**given), shown(content)):
         assert EVIL not in html
@@ -129,8 +129,7 @@ def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_noth
     assert html.index('<h2 id="paper">The paper</h2>') < html.index('<h2 id="trials">')
     for part in ('<td class="number">0.37</td>', 'href="#paper"', 'id="figure-own"'):
         assert part in html
-    # Each trial in the table of numbers, and in the list that opens.
-    assert html.count('class="status status-failed"') == 4
+    assert html.count('class="status status-failed"') == 2
     assert html.count("fewer than 5 points") == 2
 
 
@@ -155,9 +154,9 @@ def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short
 
 
 def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn():
-    html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], motions={"a": png()})
+    html = page(figures=[build.ReportFigure("law", "Law", "caption", png())])
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
-    assert [image["style"] for image in images] == ["--wide:192px"] * 2  # 2 in of 96 px
+    assert [image["style"] for image in images] == ["--wide:192px"]  # 2 in of 96 px
     assert all(str(image["src"]).startswith("data:image/webp;base64,") for image in images)
 
 
@@ -206,15 +205,22 @@ def test_upper_limits_are_in_the_displayed_unit():
     assert limit[1] == kappa.symbol
 
 
+def test_next_trials_have_their_pressure_in_the_unit_of_the_sheet():
+    trials = [{"replicates": 2, "pressure_kPa": 34.474, "pressure_unit": unit} for unit in ("psi", "kPa")]
+    shown = build.next_experiment({"trials": trials})["trials"]
+    assert (shown.head, shown.rows) == (["trials", "pressure"], [["2", "5 psi (34.5 kPa)"], ["2", "34.5 kPa"]])
+
+
 def test_pictures_stand_in_the_parts_they_belong_to():
     keys = figures_of(*DIAGNOSIS_SECTIONS)
     figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in keys]
     html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-learned_force"]
-    order += ['id="candidates"', "figure-candidates", 'id="tied"', 'id="drift"', "figure-drift"]
-    places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
+    order += ['href="figures/drift.svg"', 'id="candidates"', "figure-candidates", 'id="tied"']
+    begin = {"f": 'id="{}"', "i": "<h2 {}", "h": "<a {}"}
+    places = [html.index(begin[one[0]].format(one)) for one in order]
     assert places == sorted(places)
-    for key in keys:
+    for key in set(keys) - {"drift"}:
         assert f'download="{key}.csv"' in html
 
 
@@ -292,35 +298,19 @@ def recordings(*names: str) -> dict:
     board = {"kind": "charuco", "image": "calibration/board.png", "mm_per_px": 0.2407, "scale_rel_sigma": 9e-5}
     board |= {"reprojection_px": 0.031, "n_corners": 52, "n_pictures": 1}
     board |= {"notes": ["the target spans only 40 % of the picture"]}
-    seen = {"strips": SVG, "flags": ["before_release", "", "", "doubtful"], "calibrations": board}
-    return {kind: dict.fromkeys(names, one) for kind, one in seen.items()}
+    return {"calibrations": dict.fromkeys(names, board)}
 
 
-def test_each_trial_has_its_strip_and_motion_in_small_with_calibration_and_clips():
-    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": CLIP}
-    html = page(motions={"a": SVG}, **recordings("a"), **clips)
-    for once in (
-        'class="trial" id="trial-a"',
-        'aria-label="Strip of a with its tracked edge"',
-        'aria-label="Motion of a"',
-    ):
-        assert html.count(once) == 1
+def test_each_trial_links_to_its_pictures_in_the_folder_with_calibration():
+    files = {"strip": "figures/strip_a b.svg", "motion": "figures/trial_a.png", "clip": "overlays/a.mp4"}
+    html = page(pictures={"a": files}, clip=CLIP, **recordings("a"))
     assert not Tags(html).wrong
     for words in ("ChArUco board", "calibration/board.png", "0.240700", "0.0090 %", "0.031 px", "52 in 1", "40 %"):
         assert words in html
     assert html.count("data:image/webp;base64,ZnJhbWU=") == 2  # the frame in front of the clip that plays
-    links = ('id="trial-a"', 'href="#trial-a"', '<a href="overlays/a.mp4">', 'src="data:video/mp4;base64,ZmlsbQ=="')
-    assert all(link in html for link in links)
-
-
-def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch):
-    names = ("a", "b", "c")
-    weight = len(build.inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
-    monkeypatch.setattr(build, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
-    html = page(trials=trials(*names), **recordings(*names))
-    assert html.count('aria-label="Strip of') == 2
-    assert "The figures of 1 trials are left out here" in html
-    assert html.count("4 frames: 1 before release, 1 doubtful") == 3
+    for link in ("figures/strip_a%20b.svg", "figures/trial_a.png", "overlays/a.mp4"):
+        assert html.count(f'href="{link}"') == 1
+    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
 
 
 # The page in a real browser: no errors, no requests, adapts to the colour scheme, and prints.
@@ -339,9 +329,7 @@ def address(tmp_path_factory):
     html = page(
         trials=trials(*names, reason="a reason that is long enough to need a line of its own on any screen"),
         figures=[build.ReportFigure(key, key, "caption", svg, f"{key}.csv", "a\n1\n") for key, svg in pictures.items()],
-        motions=dict.fromkeys(names, pictures["before_after"]),
-        strips=dict.fromkeys(names, pictures["ladder"]),
-        flags=dict.fromkeys(names, ("", "doubtful")),
+        pictures={name: {"strip": "figures/strip.svg", "motion": "figures/trial.svg"} for name in names},
         clip={"trial": names[0], "caption": "caption", "mp4": (folder / "a.mp4").read_bytes(), "poster": b""},
         diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
     )

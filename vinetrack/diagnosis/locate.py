@@ -82,7 +82,7 @@ class Failure:
                 name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")
             }
             yield remark("fails_most", condition=condition, **numbers)
-        else:
+        elif math.isfinite(worst["z"]):  # not where nothing was repeated
             yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=condition)
         yield from self.drift.remarks
 
@@ -378,4 +378,6 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
         subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
         change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
-        yield _tested(subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated)
+        yield _tested(
+            subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated, pressure_unit=number.pressure_unit
+        )

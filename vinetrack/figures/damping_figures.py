@@ -135,12 +135,13 @@ def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
     straight line.
     """
     titles = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
-    kinds = [kind for kind in titles if scaling.get(kind)]
+    with_line = {kind: [one for one in scaling.get(kind) or [] if not one.get("refused")] for kind in titles}
+    kinds = [kind for kind, families in with_line.items() if families]
     if not kinds:
         return None
     fig = st.new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
-        families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
+        families = with_line[kind][:4]  # four families have twelve lines of legend above the axes
         ax.set(xscale="log", yscale="log", xlabel=_SIZES[families[0]["along"]][0], ylabel="B (N·(s/m)ⁿ)")
         for i, family in enumerate(families):
             B, B_95 = (np.array(family[name], dtype=float) for name in ("B", "B_95"))
@@ -151,7 +152,7 @@ def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
         st.plain_log_ticks(ax)
         if len(sizes) <= 8:
             ax.set_xticks(sizes)
-        left_out = len(scaling[kind]) - len(families)
+        left_out = len(with_line[kind]) - len(families)
         title = titles[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
         st.legend_above(ax, title=title, alignment="left")
     return fig
@@ -161,8 +162,7 @@ def _draw_family(
     ax: Axes, sizes: list[float], values: ArrayLike, errors: ArrayLike, trend: dict[str, Any], index: int, label: str
 ) -> None:
     """Points of one family of vines, its power law (full) and its straight line (dashed)."""
-    refused = f"\nno line: {trend['refused']}" if trend.get("refused") else ""
-    st.error_points(ax, sizes, values, errors, index, label + refused, elinewidth=1.3, zorder=3)
+    st.error_points(ax, sizes, values, errors, index, label, elinewidth=1.3, zorder=3)
     colour, span = st.VINE_COLOURS[index], np.geomspace(min(sizes) / 1.15, 1.15 * max(sizes), 100)
     if power := trend["power"]:
         label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}){_quality(power)}"
@@ -186,11 +186,12 @@ def draw_speed_scaling(scaling: dict[str, Any]) -> Figure | None:
     are fitted to the means of vines, so N is the number of vines, and p is the probability of a slope at least as
     large if there is none. Pressures that agree within 1 % count as one.
     """
-    families = (scaling.get("steady_speed") or [])[:5]  # each pressure has three lines of legend above the axes
+    with_line = [one for one in scaling.get("steady_speed") or [] if not one.get("refused")]
+    families = with_line[:5]  # each pressure has three lines of legend above the axes
     if not families:
         return None
     fig = st.new_figure(11.0, 5.2 + 0.45 * len(families))
-    left_out = len(scaling["steady_speed"]) - len(families)
+    left_out = len(with_line) - len(families)
     more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
     panels = (
         ("Speed", "steady tail speed x_ss (m/s)", "x_ss{}_m_s"),

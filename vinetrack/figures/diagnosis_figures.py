@@ -144,7 +144,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
         st.names_beside(ax, [str(name).replace("_", " ") for name in table["effect"]])
         for label, chosen in zip(ax.get_yticklabels(), table["in_answer_set"], strict=True):
             label.set_fontweight("bold" if chosen else "normal")
-        ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 1.75 * longest))
+        ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 2.2 * longest))
         ax.set_title(title, fontsize=10)
         ax.set_xticks([tick for tick in ax.get_xticks() if tick <= 1.08 * longest])
     axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
@@ -157,12 +157,12 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
 
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows with a finite gain or score and their roles: the answer set first, then by bar length; twelve at most."""
+    """Rows with a finite gain or score and their roles: the answer set first, then by bar length; eight at most."""
     height = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0))
     answer = table["in_answer_set"].astype(bool)
     role = np.where(answer, "answer", np.where(table["kind"] == "measurement", "measurement", "physical"))
     known = table.assign(height=height, in_answer_set=answer, role=role)[np.isfinite(height)]
-    return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(12)
+    return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(8)
 
 
 # Colour and line of the models in the figure of drifts

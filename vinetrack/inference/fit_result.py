@@ -18,7 +18,7 @@ from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import Printed, plot, table
-from vinetrack.core.units import decimals, display_unit, or_nan
+from vinetrack.core.units import UNITS, convert, decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_data import FitError, FitTrial
@@ -345,6 +345,17 @@ class Number(JsonRecord):
     lower: Annotated[float, or_open(-math.inf), Field(alias="lower_bound")] = -math.inf
     upper: Annotated[float, or_open(math.inf), Field(alias="upper_bound")] = math.inf
     shared: Annotated[Mapping[str, OrNaN], Field(alias="sigma_shared")] = field(default_factory=dict)
+    pressure_unit: str = "kPa"
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The unit in which people read it, a pressure that of the sheet, and the factor from SI."""
+        is_pressure = self.unit == "Pa"
+        return (
+            (UNITS[self.pressure_unit].text, convert(1.0, "Pa", self.pressure_unit))
+            if is_pressure
+            else display_unit(self.unit)
+        )
 
     @property
     def name(self) -> str:
@@ -547,7 +558,7 @@ def numbers_text(fit: Any) -> list[str]:
 
 def number_row(number: Number) -> tuple[str, ...]:
     """A number as texts in its display unit: name, value, `± standard error`, its shared part, 95 % interval, unit."""
-    unit, factor = display_unit(number.unit)
+    unit, factor = number.shown
     if math.isfinite(number.bound):
         return number.title, f"{number.bound * factor:.4g}", "at its bound", "", "", unit
     if not (math.isfinite(number.sigma) and number.sigma > 0):

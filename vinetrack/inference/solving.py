@@ -358,6 +358,7 @@ def _numbers(
                 lower=number.from_scaled(float(problem.lower[k])),
                 upper=number.from_scaled(float(problem.upper[k])),
                 shared=shared if math.isfinite(sigma[k]) else {},
+                pressure_unit=predictor.data[0].trial.pressure_unit,
             )
         )
     return tuple(numbers)

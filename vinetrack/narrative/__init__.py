@@ -37,7 +37,7 @@ def sentence(code: str, facts: Mapping[str, Any]) -> str:
 
 
 class _Words(Formatter):
-    """Formats of a sentence: those of Python, multiplied by `mm`, `kPa` or `%` before them; a name of `FORMS`; and
+    """Formats of a sentence: those of Python, multiplied by `mm` or `%` before them; a name of `FORMS`; and
     `?yes|no`, one of two texts, the first for what is true or not empty.
     """
 
@@ -46,7 +46,7 @@ class _Words(Formatter):
 
         if form.startswith("?"):
             return form[1:].split("|")[0 if value else 1]
-        for unit, factor in (("mm", 1e3), ("kPa", 1e-3), ("%", 100.0)):
+        for unit, factor in (("mm", 1e3), ("%", 100.0)):
             if form.startswith(unit):
                 return format(factor * value, form.removeprefix(unit))
         return FORMS[form](value) if form in FORMS else format(value, form)

@@ -336,7 +336,7 @@ def drift_condition(column: str) -> tuple[str, str, float]:
     return column.replace("_", " "), "", 1.0
 
 
-def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan) -> str:
+def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan, pressure_unit: str = "kPa") -> str:
     """Return how a parameter drifts: a row of the table, and the error of the sheet."""
     against, start, stop = (row[name] for name in ("against", "from_level", "to_level"))
     who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
@@ -344,7 +344,9 @@ def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan) -> str
     digits = max(decimals(error) - 1, 0)
     facts = {**row, "who": who, "amount": f"{change:.{digits}f} ± {error:.{digits}f} %"}
     if against == "sheet":
-        return sentence("drifts_from_sheet", facts | {"sigma_Pa": stated_sigma_Pa})
+        levels = {"from_level": start, "to_level": stop, "sigma": stated_sigma_Pa}
+        shown = {name: units.convert(level, "Pa", pressure_unit) for name, level in levels.items()}
+        return sentence("drifts_from_sheet", facts | shown | {"unit": units.UNITS[pressure_unit].text})
     name, unit, times = drift_condition(against)
     facts |= {"name": name, "low": f"{start * times:.3g} {unit}", "high": f"{stop * times:.3g} {unit}"}
     return sentence("rises_with", facts)

@@ -105,7 +105,7 @@ def listed_names(names: Sequence[str], last: str = "and") -> str:
 
 def verdict_line(diagnosis: Diagnosis) -> str:
     """Return the verdict in one line, with the names of effects as commands take them."""
-    return f"{diagnosis.verdict}: {_told(diagnosis, str)}"
+    return f"{'check the sheet' if diagnosis.contradicted_columns else diagnosis.verdict}: {_told(diagnosis, str)}"
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
@@ -153,7 +153,7 @@ def verdict_table(diagnosis: Diagnosis) -> list[Row]:
 
 def _thereafter(diagnosis: Diagnosis) -> str:
     """What the model lacks once all that was found is in it; blank where that is the verdict itself."""
-    if not diagnosis.effects:
+    if not diagnosis.effects or diagnosis.contradicted_columns:
         return ""
     it = "it" if len(diagnosis.effects) == 1 else "them"
     last = diagnosis.rounds[-1]
@@ -321,7 +321,7 @@ def _sigmas(row: Candidate) -> str:
 
 def value_text(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit, without symbol and unit: `1.170 ± 0.004`."""
-    _, factor = display_unit(entry.unit)
+    _, factor = entry.shown
     return with_error(factor * entry.value, factor * entry.sigma if is_finite(entry.sigma) else None)
 
 
@@ -334,7 +334,7 @@ def split_estimate(entry: Number) -> str:
     """Return a fitted number with its standard error, that of trials apart from that of what all trials share."""
     if is_finite(entry.bound) or not (entry.shared_sigma > 0 and is_finite(entry.sigma)):
         return estimate_text(entry)
-    unit, factor = display_unit(entry.unit)
+    unit, factor = entry.shown
     digits = decimals(factor * entry.sigma)
     own, shared = math.sqrt(max(entry.sigma**2 - entry.shared_sigma**2, 0.0)), entry.shared_sigma
     value, own_text, shared_text = (f"{factor * each:.{digits}f}" for each in (entry.value, own, shared))
@@ -343,10 +343,11 @@ def split_estimate(entry: Number) -> str:
 
 def quantity_text(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit: `1.170 ± 0.004`."""
-    unit, factor = display_unit(entry.unit)
+    unit, factor = entry.shown
     if is_finite(entry.bound):
         return f"{number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
     text = f"{value_text(entry)} {unit}".strip()
+    text += f" ({number(1e-3 * entry.value)} kPa)" if entry.unit == "Pa" and unit != "kPa" else ""
     if entry.value < entry.lower or entry.value > entry.upper:
         text += " (negative, which is impossible)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
     return text
@@ -367,7 +368,7 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
         alike = [rival for rival in rivals if rival.parameter == size.key] or alike
     if not alike:
         return ""
-    factor = display_unit(size.unit)[1]
+    factor = size.shown[1]
     low, high = min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
     names = []
     for rival in alike:
@@ -379,7 +380,7 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
 
 def bounds_text(entry: Number, with_unit: bool = False) -> str:
     """Return the ends of the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
-    unit, factor = display_unit(entry.unit)
+    unit, factor = entry.shown
     if not (is_finite(entry.low) and is_finite(entry.high)):
         return "open"
     text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit if with_unit else ''}".strip()

@@ -166,8 +166,8 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
         return diagnosis
     others = (note for note in diagnosis.notes if str(note) not in contradictions.values())
     notes = (*contradictions.values(), *others)
-    contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes)
-    return replace(contradicted, explanation=f"{verdict_sentence(contradicted)} {diagnosis.explanation}")
+    contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes, next_experiment=None)
+    return replace(contradicted, explanation=verdict_sentence(contradicted))
 
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:

@@ -7,7 +7,6 @@ import contextlib
 import io
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +18,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from vinetrack.core.units import display_unit, interval, number, with_error
+from vinetrack.core.units import display_unit, interval, number, pressure_text, with_error
 from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
@@ -275,10 +274,14 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     trials = [dict(trial) for trial in content.get("trials") or []]
     keys = ("replicates", *LIMITED["range"], *(name for name in LIMITED["choice"] if name != "growth_angle_deg"))
     shown = [key for key in keys if any(is_finite(trial.get(key)) for trial in trials)]
-    head = [{"replicates": "trials"}.get(key, key.rpartition("_")[0] + f" ({key.rpartition('_')[2]})") for key in shown]
-    rows = [
-        [number(trial.get(key)) if key != "replicates" else str(trial.get(key)) for key in shown] for trial in trials
-    ]
+    whole = {"replicates": "trials", "pressure_kPa": "pressure"}
+    head = [whole.get(key, key.rpartition("_")[0] + f" ({key.rpartition('_')[2]})") for key in shown]
+    rows = []
+    for trial in trials:
+        texts = {"replicates": str(trial.get("replicates"))}
+        pressure_Pa = 1e3 * trial.get("pressure_kPa", math.nan)
+        texts["pressure_kPa"] = pressure_text(pressure_Pa, trial.get("pressure_unit", "kPa"))
+        rows.append([texts.get(key) or number(trial.get(key)) for key in shown])
     separations = [
         (" from ".join(map(spaced_name, pair.split(" | "))), number(sigma, 2))
         for pair, sigma in (content.get("separation_sigma") or {}).items()
@@ -403,15 +406,7 @@ def _ours(row: Any) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Trials in the report: values, status and reason, strip, motion, data, and calibration.
-
-
-def count_frames(flags: Sequence[str]) -> str:
-    """Return the number of frames, and of those with each flag, as text."""
-    counted = Counter(filter(None, ";".join(flags).split(";")))
-    words = {"lost": "without the edge", "corrected": "corrected by hand", "after_end": "after the end"}
-    parts = [f"{count} {words.get(flag, flag.replace('_', ' '))}" for flag, count in counted.items()]
-    return f"{len(flags)} frames" + (f": {', '.join(parts)}" if parts else "")
+# Calibration.
 
 
 def calibration_table(calibrations: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -448,30 +443,6 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
         "notes": first["notes"],
         "trials": f"{len(members)} recordings" if len(members) > 1 else members[0][0],
     }
-
-
-MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single trials
-
-
-def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int]:
-    """Return all trials for the template, and how many of them have their figures left out for size."""
-    entries, left_out, weight = [], 0, 0
-    for k, row in enumerate(rows(content["trials"])):
-        name, kinds = row.trial, ("strips", "motions", "flags")
-        strip, motion, flags = (None if row.status == "failed" else content[kind].get(name) for kind in kinds)
-        strip = inline_picture(strip, f"s{k}", f"Strip of {name} with its tracked edge")
-        motion = inline_picture(motion, f"t{k}", f"Motion of {name}")
-        if weight + len(strip) + len(motion) > MAX_TRIAL_FIGURES_BYTES:
-            left_out += bool(strip or motion)
-            strip = motion = Markup()
-        weight += len(strip) + len(motion)
-        entry = {
-            "row": row,
-            "frames": count_frames(flags) if flags else "",
-            "clip": content["clips"].get(name, ""),
-        }
-        entries.append({**entry, "strip": strip, "motion": motion})
-    return entries, left_out
 
 
 def _csv(table: pd.DataFrame) -> str:
@@ -539,11 +510,8 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "damping": read_json(results.damping),
         "provenance": provenance,
         "figures": _figures(tables, campaign_figures().values()),
-        "motions": {name: _picture(partial(results.trial_figure, name)) for name in drawn},
-        "strips": {name: _picture(partial(results.strip_figure, name)) for name in filmed},
-        "flags": {name: read_result(results.track(name))["flag"].tolist() for name in filmed},
+        "pictures": {name: _pictures(results, name) for name in drawn},
         "calibrations": {name: one for name, one in seen.items() if one},
-        "clips": {name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         "clip": _clip(results, tables.diagnosed, trials),
         "fit": read_fit(results),
         "comparison": read_result(results.comparison),
@@ -561,6 +529,14 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
     if svg.exists() and svg.stat().st_size <= MAX_SVG_BYTES:
         return svg.read_text(encoding="utf-8")
     return png.read_bytes() if png.exists() else b""
+
+
+def _pictures(results: Results, name: str) -> dict[str, str]:
+    """Return the files that show one trial, by what they are, as a page in the results folder links to them."""
+    drawn = {"strip": results.strip_figure, "motion": results.trial_figure}
+    files = [(word, path(name, form)) for form in (".svg", ".png") for word, path in drawn.items()]
+    files.append(("clip", results.overlay(name)))
+    return {word: path.relative_to(results.folder).as_posix() for word, path in files if path.exists()}
 
 
 def _figures(tables: FigureTables, figures: Iterable[RegisteredFigure]) -> list[ReportFigure]:
@@ -617,12 +593,11 @@ def build_report(content: dict[str, Any]) -> str:
     }
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
-    in_templates = (rows, display_unit, bounds_text, listed_names, expected_text, model_errors, final_errors)
+    in_templates = (rows, bounds_text, listed_names, expected_text, model_errors, final_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
     figures = {part: [one for section, one in drawn if section == part] for part in sections.values()}
-    trials, n_left_out = trial_entries(content)
     laws = [
         (vine, law, method)
         for method in LAW_METHODS
@@ -638,8 +613,6 @@ def build_report(content: dict[str, Any]) -> str:
             "final": content["diagnosis"],
             "diagnosis": diagnosis_section(content),
             "figures": figures,
-            "trials": trials,
-            "n_left_out": n_left_out,
             "calibrations": calibration_table(content["calibrations"]),
             "run": content["provenance"]["settings"],
         }
