@@ -350,12 +350,9 @@ class Number(JsonRecord):
     @property
     def shown(self) -> tuple[str, float]:
         """The unit in which people read it, a pressure that of the sheet, and the factor from SI."""
-        is_pressure = self.unit == "Pa"
-        return (
-            (UNITS[self.pressure_unit].text, convert(1.0, "Pa", self.pressure_unit))
-            if is_pressure
-            else display_unit(self.unit)
-        )
+        if self.unit != "Pa":
+            return display_unit(self.unit)
+        return UNITS[self.pressure_unit].text, convert(1.0, "Pa", self.pressure_unit)
 
     @property
     def name(self) -> str:

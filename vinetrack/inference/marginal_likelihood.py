@@ -375,9 +375,9 @@ def levenberg_marquardt_step(
 
 def trial_effect_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, *, fixed_release: bool = False
-) -> tuple[Floats, Floats]:
-    """Gauss–Newton step of the trial effects at fixed parameters, and the decrease of each trial's penalised sum of
-    squares that it predicts. Shapes: cross_products (n_trials, 3, k, k) → (n_trials, 4), (n_trials,).
+) -> Floats:
+    """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
+    (n_trials, 4).
     """
     white = _with_prior_gradient(cross_products, problem, state)
     square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
@@ -385,8 +385,7 @@ def trial_effect_step(
     if fixed_release:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
-    step = solve_per_trial(square, slope)[:, :, 0]
-    return step, np.sum(step * slope[:, :, 0], axis=1)
+    return solve_per_trial(square, slope)[:, :, 0]
 
 
 def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:

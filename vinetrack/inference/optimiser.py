@@ -388,25 +388,20 @@ def _accepted_step(
     turn it across the valley. `penalised_squares` is that of the current state.
     """
 
-    def lowered(step: Floats, effect_step: Floats, *, reject_by_prediction: bool = False) -> FitState | None:
-        # A step is rejected without simulating the new trial effects where their linear prediction cannot make up for
-        # it.
+    def lowered(step: Floats, effect_step: Floats) -> FitState | None:
         theta = np.clip(state.theta + step, problem.lower, problem.upper)
         try:
             effects = limited_step(predictor, state.trial_effects, effect_step)
             reached = replace(state, theta=theta, trial_effects=effects)
-            largest_cost = penalised_squares - shared_penalty(problem, reached)
-            reached, costs = optimise_trial_effects(
-                predictor, problem, reached, largest_cost if reject_by_prediction else math.inf
-            )
+            reached, costs = optimise_trial_effects(predictor, problem, reached)
         except SimulationError:
             return None
-        return reached if float(np.sum(costs)) < largest_cost else None
+        return reached if float(np.sum(costs)) + shared_penalty(problem, reached) < penalised_squares else None
 
     # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
     # increased (chosen)
     for fraction in (1.0, 0.4, 0.15):
-        candidate = lowered(fraction * step, fraction * effect_step, reject_by_prediction=True)
+        candidate = lowered(fraction * step, fraction * effect_step)
         if candidate is not None:
             return candidate, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(11):

@@ -133,23 +133,16 @@ def subset(
 LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
 
 
-def optimise_trial_effects(
-    predictor: Predictor, problem: MixedProblem, state: FitState, largest_useful_cost: float = math.inf
-) -> tuple[FitState, Floats]:
+def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
     """One Gauss–Newton step of the trial effects at fixed parameters, and the resulting cost of each trial. The trial
     effects are determined so precisely that a step of the shared parameters leaves the curved valley; this step returns
     to it. Returns state, costs. Shape (n_trials,).
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     cross_products = predictor.products(columns)
-    (step, decrease), (step_at_release, _) = (
-        trial_effect_step(cross_products, problem, state, fixed_release=fixed_release)
-        for fixed_release in (False, True)
-    )
+    steps = (trial_effect_step(cross_products, problem, state, fixed_release=fixed) for fixed in (False, True))
     current_costs = trial_costs(predictor, problem, state, residuals_in(columns))
-    if float(np.sum(current_costs - decrease)) >= largest_useful_cost:
-        return state, current_costs
-    moved_effects = [limited_step(predictor, state.trial_effects, each) for each in (step, step_at_release)]
+    moved_effects = [limited_step(predictor, state.trial_effects, step) for step in steps]
     candidates = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved_effects)]
     residuals_of_candidates = zip(candidates[1:], predictor.residuals_of_each(state.theta, moved_effects), strict=True)
     costs = np.array(
