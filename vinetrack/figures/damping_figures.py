@@ -135,13 +135,12 @@ def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
     straight line.
     """
     titles = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
-    with_line = {kind: [one for one in scaling.get(kind) or [] if not one.get("refused")] for kind in titles}
-    kinds = [kind for kind, families in with_line.items() if families]
+    kinds = [kind for kind in titles if scaling.get(kind)]
     if not kinds:
         return None
     fig = st.new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
-        families = with_line[kind][:4]  # four families have twelve lines of legend above the axes
+        families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
         ax.set(xscale="log", yscale="log", xlabel=_SIZES[families[0]["along"]][0], ylabel="B (N·(s/m)ⁿ)")
         for i, family in enumerate(families):
             B, B_95 = (np.array(family[name], dtype=float) for name in ("B", "B_95"))
@@ -152,7 +151,7 @@ def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
         st.plain_log_ticks(ax)
         if len(sizes) <= 8:
             ax.set_xticks(sizes)
-        left_out = len(with_line[kind]) - len(families)
+        left_out = len(scaling[kind]) - len(families)
         title = titles[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
         st.legend_above(ax, title=title, alignment="left")
     return fig
@@ -162,7 +161,8 @@ def _draw_family(
     ax: Axes, sizes: list[float], values: ArrayLike, errors: ArrayLike, trend: dict[str, Any], index: int, label: str
 ) -> None:
     """Points of one family of vines, its power law (full) and its straight line (dashed)."""
-    st.error_points(ax, sizes, values, errors, index, label, elinewidth=1.3, zorder=3)
+    refused = f"\nno line: {trend['refused']}" if trend.get("refused") else ""
+    st.error_points(ax, sizes, values, errors, index, label + refused, elinewidth=1.3, zorder=3)
     colour, span = st.VINE_COLOURS[index], np.geomspace(min(sizes) / 1.15, 1.15 * max(sizes), 100)
     if power := trend["power"]:
         label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}){_quality(power)}"
