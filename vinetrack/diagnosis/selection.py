@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,10 +54,6 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------
 # Fits of effects, and of sets of them by forward steps: from the best sets of k effects, those are added that the score
