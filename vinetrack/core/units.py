@@ -118,15 +118,22 @@ UNITS = {
     for name, scale, *text in (unit.split("=") for unit in units.split())
 }
 
-# Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
-DISPLAY_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "kg": ("g", 1e3), "1": ("", 1.0)}
+# Display unit by SI unit, and the factor from SI: masses are shown in grams; "1" is dimensionless
+DISPLAY_UNITS = {"kg": ("g", 1e3), "1": ("", 1.0)}
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders
 PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predictions
 
 
-def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS) -> tuple[str, float]:
-    """Return the display unit of an SI unit and the factor from SI: itself and 1.0 if it has no other."""
-    return table.get(unit, (unit, 1.0))
+def display_unit(
+    unit: str, pressure_unit: str = "kPa", table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS
+) -> tuple[str, float]:
+    """Return the display unit of an SI unit and the factor from SI: itself and 1.0 if it has no other. Pressures, and
+    what is counted per pressure, have the unit of the user's sheet.
+    """
+    if unit not in ("Pa", "1/Pa"):
+        return table.get(unit, (unit, 1.0))
+    text, factor = UNITS[pressure_unit].text, convert(1.0, "Pa", pressure_unit)
+    return (text, factor) if unit == "Pa" else (f"1/{text}", 1 / factor)
 
 
 def split_unit(name: str) -> tuple[str, str]:

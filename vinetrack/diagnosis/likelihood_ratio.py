@@ -175,7 +175,7 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
                 if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
                     unit = "" if parameter.unit == "1" else parameter.unit
                     facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
-                    return False, Remark("implausible_size", facts)
+                    return False, Remark("implausible_size", facts | {"pressure_unit": number.pressure_unit})
     return True, Remark()
 
 

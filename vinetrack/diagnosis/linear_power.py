@@ -270,6 +270,7 @@ def _effect_power(
         sizes=tuple((zero + steps).tolist()),
         taken_for=taken_for,
         other_values=shape.other_values,
+        pressure_unit=tests.fit.trials[0].trial.pressure_unit,
     )
 
 

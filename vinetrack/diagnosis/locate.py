@@ -338,7 +338,8 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
         # Relative change from the smaller value, with its standard error
         larger = math.exp(abs(slope) * reach)
         change = larger - 1, larger * sigma * reach
-        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, p, dof, d.size, groups)
+        pressure = {"pressure_unit": estimates.number.pressure_unit}
+        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, p, dof, d.size, groups, **pressure)
 
 
 def _steady_change(

@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 from vinetrack.core.problems import Remark, in_words
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import Printed, plot
+from vinetrack.core.units import display_unit
 from vinetrack.inference.fit_result import Fit, Number, OrNaN, or_open
 
 if TYPE_CHECKING:
@@ -55,6 +56,12 @@ class EffectPower(JsonRecord):
     sizes: tuple[Annotated[float, or_open(math.inf)], ...]
     taken_for: Mapping[str, OrNaN] = field(default_factory=dict)
     other_values: tuple[float, ...] = ()
+    pressure_unit: str = "kPa"
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The unit in which people read its sizes, and the factor from SI."""
+        return display_unit(self.unit, self.pressure_unit)
 
     def size_at(self, probability: float) -> float:
         """The value of the parameter at which the effect is detected with this probability. Returns SI; infinite where
@@ -389,6 +396,11 @@ class Diagnosis(Printed, JsonRecord):
     def refutes(self) -> bool:
         """Whether the initial model lacks physics, so that figures drawn with it must state that."""
         return self.verdict in (MISSING, AMBIGUOUS, UNEXPLAINED)
+
+    @property
+    def pressure_unit(self) -> str:
+        """The unit of pressures in the sheet."""
+        return next((one.pressure_unit for one in self.parameters), "kPa")
 
     @property
     def initial_model(self) -> tuple[str, ...]:

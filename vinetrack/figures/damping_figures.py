@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.units import interval, number, with_interval
+from vinetrack.core.units import interval, number, pressure_text, with_interval
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
 from vinetrack.narrative.diagnosis_text import METHOD_NAMES
@@ -178,8 +178,12 @@ def _quality(line: dict[str, Any]) -> str:
     return f", R² {number(line['R2'])}, p = {number(line['p'], 2)}"
 
 
+def _pressure(family: dict[str, Any], unit: str) -> str:
+    return pressure_text(1e3 * family["pressure_kPa"], unit, 4)
+
+
 @figure("speed_scaling", "damping", "Steady speed against size", data="conditions.csv")
-def draw_speed_scaling(scaling: dict[str, Any]) -> Figure | None:
+def draw_speed_scaling(scaling: dict[str, Any], pressure_unit: str = "kPa") -> Figure | None:
     """Steady tail speed of scaled copies (one t/D) at one pressure without payload, against diameter, and the same
     divided by the diameter (Fig. 8 of the paper). Points are means over a vine's steady trials with their standard
     errors (that of a single trial does not include replicate scatter); power laws (full) and straight lines (dashed)
@@ -202,15 +206,15 @@ def draw_speed_scaling(scaling: dict[str, Any]) -> Figure | None:
         for i, family in enumerate(families):
             values, errors = (np.array(family[key.format(part)], dtype=float) for part in ("", "_sigma"))
             n = f"{st.counted([values.size], 'vine')} of {st.counted(family['n_steady'], 'trial')}"
-            trend = family["over_diameter"] if "over" in key else family
-            _draw_family(ax, family["sizes"], values, errors, trend, i, f"{family['pressure_kPa']:.4g} kPa, N = {n}")
+            trend, pressure = family["over_diameter"] if "over" in key else family, _pressure(family, pressure_unit)
+            _draw_family(ax, family["sizes"], values, errors, trend, i, f"{pressure}, N = {n}")
         st.up_from_zero(ax, x=True)
         st.legend_above(ax, title=title + more, alignment="left", fontsize=9)
     return fig
 
 
 @figure("efficiency", "damping", "Energy efficiency", data="conditions.csv")
-def draw_efficiency(scaling: dict[str, Any]) -> Figure | None:
+def draw_efficiency(scaling: dict[str, Any], pressure_unit: str = "kPa") -> Figure | None:
     """Energy efficiency against wall thickness and diameter at one pressure, payload, length and growth (Fig. 9 of the
     paper): kinetic energy of all moving mass divided by the work of the gas P₀Ay; of the payload alone; and with the
     work of the weight added to the denominator. Points are means with standard errors; the powers of wall and diameter
@@ -238,7 +242,7 @@ def draw_efficiency(scaling: dict[str, Any]) -> Figure | None:
         ax.set_title(definitions[key], fontsize=10.5)
     load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
     more = f"; {n_left} more {'family' if n_left == 1 else 'families'} in scaling.json" if n_left else ""
-    title = f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
+    title = f"{_pressure(family, pressure_unit)}{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
     fig.suptitle(f"{title}{st.per_point(family['n_efficiency'])}{more}", fontsize=11, x=0.01, ha="left")
     return fig
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.units import number
+from vinetrack.core.units import display_unit, number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
@@ -170,7 +170,7 @@ _MODELS = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
 
 
 @figure("drift", "drift", "Parameters that change with a condition", data="drift")
-def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
+def draw_drift(drift: pd.DataFrame, added: str, pressure_unit: str = "kPa") -> Figure | None:
     """The best B in groups of trials, relative to the common law, against a condition on which it should not depend;
     bars are one standard error from the scatter of replicates. With a complete model all are 1.
     """
@@ -186,7 +186,7 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
     fig = st.new_figure(1.0 + 3.2 * n_columns, 0.9 + 2.6 * math.ceil(len(panels) / n_columns))
     for ax, (parameter, against) in zip(st.panel_grid(fig, len(panels), n_columns), panels, strict=True):
         groups = known[(known["parameter"] == parameter) & (known["against"] == against)]
-        name, unit, factor = drift_condition(str(against))
+        name, unit, factor = drift_condition(str(against), pressure_unit)
         for model, (colour, line) in _MODELS.items():
             of_model = groups[groups["model"] == model]
             for vine, of_vine in of_model.groupby("vine", sort=False):
@@ -260,17 +260,16 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
     return fig
 
 
-# Quantities that the force may depend on: label, and factor from SI
+# Quantities that the force may depend on besides the pressure: label, and factor from SI
 _FORCE_AXES = {
     "lead_position_m": ("growth y (mm)", 1e3),
     "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
     "time_s": ("time since release (ms)", 1e3),
-    "pressure_Pa": ("pressure (kPa)", 1e-3),
 }
 
 
 @figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force")
-def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
+def draw_learned_force(learned_force: pd.DataFrame, pressure_unit: str = "kPa") -> Figure | None:
     """The missing force, learned within the fit as a smooth function of the variables on which it most likely
     depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the
     range of the trials. The part that B, n and the yield pressure could absorb is undetermined, and included in the
@@ -280,18 +279,19 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
         return None
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
-    variables = [name for name in _FORCE_AXES if name in grid and grid[name].notna().any()]
+    unit, factor = display_unit("Pa", pressure_unit)
+    known = _FORCE_AXES | {"pressure_Pa": (f"pressure ({unit})", factor)}
+    axes = {name: axis for name, axis in known.items() if name in grid and grid[name].notna().any()}
     conditions = f"N = {along['condition'].nunique()} conditions"
-    if len(variables) == 2:
+    if len(axes) == 2:
         fig = st.new_figure(9.6, 4.4)
         left, right = fig.subplots(1, 2, sharex=True, sharey=True)
-        _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
-        _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
+        _draw_map(left, grid, along, axes, "force_N", "missing force (N)")
+        _draw_map(right, grid, along, axes, "sigma_N", "its standard error (N)")
         st.small_title(left, f"grey: trials, {conditions}", color=st.MUTED)
         right.set_ylabel("")
         return fig
-    (variable,) = variables
-    words, factor = _FORCE_AXES[variable]
+    ((variable, (words, factor)),) = axes.items()
     fig, ax = st.one_panel(6.4, 3.6, xlabel=words, ylabel="missing force (N)")
     seen = grid[grid["trials"] > 0].sort_values(variable)
     at, force, half = st.column(seen, variable, factor), st.column(seen, "force_N"), st.column(seen, "sigma_N", 1.96)
@@ -306,12 +306,14 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     return fig
 
 
-def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list[str], name: str, label: str) -> None:
+def _draw_map(
+    ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, axes: dict[str, tuple[str, float]], name: str, label: str
+) -> None:
     """A map of the force, which has a sign, or of its error; blank without trials, where the force is the prior's."""
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.ticker import MaxNLocator
 
-    (x_words, x_factor), (y_words, y_factor) = (_FORCE_AXES[variable] for variable in variables)
+    variables, ((x_words, x_factor), (y_words, y_factor)) = list(axes), axes.values()
     wide = grid.pivot_table(index=variables[1], columns=variables[0], values=[name, "trials"])
     values: Floats = np.where(wide["trials"].to_numpy(float) > 0, wide[name].to_numpy(float), np.nan)
     x, y = x_factor * wide[name].columns.to_numpy(float), y_factor * wide[name].index.to_numpy(float)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, with_flag
+from vinetrack.core.units import pressure_text
 from vinetrack.figures import style as st
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @st.look()
-def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
+def draw_strip(title: str, tracking: Tracking, m_per_px: float, pressure_unit: str = "kPa") -> Figure:
     """Draw the strip of one tracked recording."""
     pictures = tracking.pictures
     wide_in = 7.2 / len(pictures) - 0.08
@@ -61,9 +62,10 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     label = f"corrected by hand, N = {by_hand.sum()}"
     panel.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", label=label)
     if track.pressure_Pa is not None:
-        most_kPa = float(np.max(track.pressure_Pa / 1e3))
-        over, label = st.Panel(sheet, box, (0.0, 1.08 * most_kPa), ends_ms), f"pressure, up to {most_kPa:.3g} kPa"
-        over.plot(track.pressure_Pa / 1e3, time_ms, color=st.VERMILLION, lw=1.2, label=label)
+        most_Pa = float(np.max(track.pressure_Pa))
+        over = st.Panel(sheet, box, (0.0, 1.08 * most_Pa), ends_ms)
+        label = f"pressure, up to {pressure_text(most_Pa, pressure_unit)}"
+        over.plot(track.pressure_Pa, time_ms, color=st.VERMILLION, lw=1.2, label=label)
     panel.scale("left", "time (ms)" if timed else "frame", grid=False)
     panel.scale("bottom", "along the growth axis (px)", grid=False)
     st.legend_above(sheet, 2, bbox_to_anchor=(0.75, below_in + 2.63), bbox_transform=sheet.transData)

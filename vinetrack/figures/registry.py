@@ -119,6 +119,11 @@ class FigureTables:
         is_fitted = any(self.damping[method]["vines"] for method in METHOD_NAMES)
         return points.assign(used=points["used"] & is_fitted)
 
+    @property
+    def pressure_unit(self) -> str:
+        """The unit of pressures in the sheet."""
+        return self.known[0].pressure_unit if self.known else "kPa"
+
     @cached_property
     def trials(self) -> pd.DataFrame:
         """`trials.csv` with pressure and label of the condition."""

@@ -18,7 +18,7 @@ from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import Printed, plot, table
-from vinetrack.core.units import UNITS, convert, decimals, display_unit, or_nan
+from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_data import FitError, FitTrial
@@ -350,9 +350,7 @@ class Number(JsonRecord):
     @property
     def shown(self) -> tuple[str, float]:
         """The unit in which people read it, a pressure that of the sheet, and the factor from SI."""
-        if self.unit != "Pa":
-            return display_unit(self.unit)
-        return UNITS[self.pressure_unit].text, convert(1.0, "Pa", self.pressure_unit)
+        return display_unit(self.unit, self.pressure_unit)
 
     @property
     def name(self) -> str:

@@ -81,7 +81,8 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...
     sigma = np.array([number.sigma for number in numbers])
     ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
     affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= MATTERS]
-    changes = [(numbers[k].title, moved[k], numbers[k].unit) for k in affected]
+    shown = [(numbers[k], moved[k], *numbers[k].shown) for k in affected]
+    changes = [(number.title, factor * size, unit) for number, size, unit, factor in shown]
     return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
 
 

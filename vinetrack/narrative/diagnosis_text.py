@@ -23,6 +23,7 @@ from vinetrack.narrative.verdict_text import (
     odd_in_words,
     percent,
     spaced_name,
+    value_text,
     verdict_line,
     verdict_table,
 )
@@ -47,7 +48,7 @@ def size_text(power: EffectPower, value: float) -> str:
     """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none."""
     if not math.isfinite(value):
         return "–"
-    unit, factor = display_unit(power.unit)
+    unit, factor = power.shown
     return f"{number(factor * value, 2)} {unit}".strip()
 
 
@@ -269,7 +270,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     return list(table(body, headings, align="<>>>><"))
 
 
-def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
+def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables."""
     # The model with the effect contains the one without it: a loss shows that the optimiser has not converged.
     gain = 2 * (after.log_likelihood - before.log_likelihood)
@@ -284,13 +285,8 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame, numbers: pd.Da
         "",
         "parameters",
     ]
-    changed: dict[tuple[str, str], dict[str, str]] = {}
-    for row in numbers.to_dict("records"):
-        unit, factor = display_unit(row["unit"])
-        title = f"{row['symbol']} ({row['vine']})" if row["vine"] else row["symbol"]
-        place = changed.setdefault((title, unit), {})
-        place["after" if row["added"] else "before"] = with_error(row["value"] * factor, row["sigma"] * factor)
-    body = [(title, of.get("before", "–"), of.get("after", "–"), unit) for (title, unit), of in changed.items()]
+    was, now = ({(one.title, one.shown[0]): value_text(one) for one in fit.numbers} for fit in (before, after))
+    body = [(title, was.get((title, unit), "–"), now.get((title, unit), "–"), unit) for title, unit in was | now]
     lines += table(body, ("", "before", "after", "unit"), align="<>><")
     return lines + [f"! {message}" for message in after.messages]
 
@@ -328,11 +324,12 @@ def fails_most_text(worst_residual_m: float, worst_sigma_m: float, **facts: Any)
     return sentence("fails_most_at", facts)
 
 
-def drift_condition(column: str) -> tuple[str, str, float]:
+def drift_condition(column: str, pressure_unit: str = "kPa") -> tuple[str, str, float]:
     """Return name, unit and factor from SI of a condition that a parameter may drift with."""
     for known in COLUMNS.values():
         if known.field == column and known.scale:
-            return known.quantity, known.unit, known.scale.from_si(1.0)
+            scale = units.UNITS[pressure_unit] if known.scale.si == "Pa" else known.scale
+            return known.quantity, scale.text, scale.from_si(1.0)
     return column.replace("_", " "), "", 1.0
 
 
@@ -347,7 +344,7 @@ def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan, pressu
         levels = {"from_level": start, "to_level": stop, "sigma": stated_sigma_Pa}
         shown = {name: units.convert(level, "Pa", pressure_unit) for name, level in levels.items()}
         return sentence("drifts_from_sheet", facts | shown | {"unit": units.UNITS[pressure_unit].text})
-    name, unit, times = drift_condition(against)
+    name, unit, times = drift_condition(against, pressure_unit)
     facts |= {"name": name, "low": f"{start * times:.3g} {unit}", "high": f"{stop * times:.3g} {unit}"}
     return sentence("rises_with", facts)
 
@@ -445,7 +442,7 @@ def _size_text(trial: Trial) -> str:
 
 def value_in_unit(value: float, unit: str) -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
-    return "never" if math.isinf(value) else number(value * display_unit(unit, units.PREDICTION_UNITS)[1])
+    return "never" if math.isinf(value) else number(value * display_unit(unit, table=units.PREDICTION_UNITS)[1])
 
 
 def speed_band_text(share: Band) -> str:
@@ -455,8 +452,7 @@ def speed_band_text(share: Band) -> str:
 
 def _changes(changes: Sequence[tuple[str, float, str]]) -> str:
     """The first four numbers with the sizes of their changes, in display units."""
-    sized = [(name, f"{size * times:.2g} {u}") for name, size, unit in changes for u, times in [display_unit(unit)]]
-    told = [f"{name} by {size}".rstrip() for name, size in sized]
+    told = [f"{name} by {size:.2g} {unit}".rstrip() for name, size, unit in changes]
     return ", ".join(told[:4]) + (f", and {len(told) - 4} more" if len(told) > 4 else "")
 
 
@@ -488,9 +484,9 @@ FORMS: dict[str, Callable[[Any], str]] = {
 }
 
 
-def _implausible_text(symbol: str, value: float, unit: str, low: float, high: float) -> str:
+def _implausible_text(symbol: str, value: float, unit: str, low: float, high: float, pressure_unit: str = "kPa") -> str:
     """Say which size an effect would need, in the unit in which its estimate is shown, and which are plausible."""
-    shown, factor = display_unit(unit or "1")
+    shown, factor = display_unit(unit or "1", pressure_unit)
     would = f"{symbol} = {factor * value:.3g} {shown}".rstrip()
     return f"it would need {would}, and {factor * low:.3g} to {factor * high:.3g} is plausible"
 

@@ -372,7 +372,7 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     low, high = min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
     names = []
     for rival in alike:
-        unit, times = display_unit(rival.unit)
+        unit, times = display_unit(rival.unit, size.pressure_unit)
         limit = f"{number(rival.limit * times, 2)} {unit}".rstrip()
         names.append(f"{spaced_name(rival.effect)} ({rival.symbol} up to {limit})")
     return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"

@@ -237,6 +237,7 @@ class SizeControl:
     effect: str
     parameter: Parameter
     vine: str
+    pressure_unit: str = "kPa"
 
     @property
     def key(self) -> str:
@@ -279,8 +280,9 @@ def choice_in_use(campaign: Campaign) -> ModelChoice:
 
 def sizes_of(campaign: Campaign, effect: Effect) -> list[SizeControl]:
     """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value."""
+    pressure_unit = campaign.trials[0].data.trial.pressure_unit
     return [
-        SizeControl(effect.name, parameter, vine)
+        SizeControl(effect.name, parameter, vine, pressure_unit)
         for parameter in effect.parameters
         for vine in campaign.groups(parameter.shared)
     ]

@@ -27,7 +27,7 @@ class SizeSlider:
 
     def __init__(self, size: SizeControl, value: float, disabled: bool, moved: Callable[[str, float], None]) -> None:
         self.size = size
-        unit, self._factor = display_unit(size.parameter.unit, SLIDER_UNITS)
+        unit, self._factor = display_unit(size.parameter.unit, size.pressure_unit, SLIDER_UNITS)
         what = size.vine or size.parameter.meaning
         self._opened = slider_range(size.key, size.parameter, value)
         self.slider = bk.Slider(

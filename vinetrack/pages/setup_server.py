@@ -126,7 +126,7 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
             notes.append(f"pressure_trace {error}")
     # Without a rate the figure counts frames.
     drawn = track if timed else replace(track, time_s=np.full_like(track.time_s, np.nan))
-    fig = draw_strip(trial.name, replace(tracking, track=drawn), mm_per_px / 1e3)
+    fig = draw_strip(trial.name, replace(tracking, track=drawn), mm_per_px / 1e3, trial.pressure_unit)
     _, _, bottom_in, top_in = fig.axes[0].images[0].get_extent()
     return {
         "strip": _strip_url(fig),

@@ -247,7 +247,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) 
     """Add an effect to the model and refit. Returns lines, and the ladder of errors of both models."""
     tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))[0]}
     before, after, table = add(experiment, tracks, name, report)
-    return added_in_words(before, after, table, moved((before, after), ("", name))), table.to_dict("records")
+    return added_in_words(before, after, table), table.to_dict("records")
 
 
 def propose_effect(

@@ -182,7 +182,7 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
         if one.why.code != "constant":  # constants of nature are left out
             low, median, high = (value_in_unit(value, one.unit) for value in (one.low, one.median, one.high))
             band = "–" if one.low == one.high else f"{low} to {high}"
-            rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.why)))
+            rows.append((one.symbol, median, band, display_unit(one.unit, table=PREDICTION_UNITS)[0], str(one.why)))
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     columns = ("prediction", "at y/L", "median", "90 % band", "unit")
@@ -209,7 +209,7 @@ def _quantity_row(quantity: Band) -> tuple[str, str, str, str, str]:
     if unit == "Pa":
         texts, unit = [number(value / 1e6) for value in values], "MPa"
     else:
-        texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
+        texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, table=PREDICTION_UNITS)[0]
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
@@ -562,14 +562,14 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
     name, _, size = text.partition("=")
     if name in power.not_testable:
         return name, math.nan
-    known = {entry.effect: entry.unit for entry in power.effects}
+    known = {entry.effect: entry.shown for entry in power.effects}
     if name not in known:
         candidates = sorted([*known, *power.not_testable])
         close = difflib.get_close_matches(name, candidates, 1, 0.6)
         remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
         message = "is in the model already" if name in power.model else "is not a candidate for these trials"
         raise refusal("--effect", name, message, remedy)
-    unit, factor = display_unit(known[name])
+    unit, factor = known[name]
     try:
         return name, float(size or "nan") / factor
     except ValueError:

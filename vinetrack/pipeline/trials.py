@@ -186,13 +186,14 @@ def _draw(
         return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
 
     def strip() -> Figure:
-        return (
-            draw_strip(name, measurement.tracking, measurement.m_per_px) if measurement else blank(f"{name}: {reason}")
-        )
+        if measurement is None:
+            return blank(f"{name}: {reason}")
+        return draw_strip(name, measurement.tracking, measurement.m_per_px, unit)
 
+    unit = "kPa" if trial is None else trial.pressure_unit
     kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, motion)
     if trial is not None and trial.video is not None:
-        seen = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections)
+        seen = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections, unit)
         kept.figure(("strip", name, *seen), partial(results.strip_figure, name), settings, strip)
 
 

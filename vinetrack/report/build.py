@@ -182,7 +182,8 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     if power is not None and not power.wary:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     # Upper limits are valid only if no effect is missing.
-    limits = upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects)
+    last = diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else ()
+    limits = upper_limits(last, effects, diagnosis.pressure_unit)
     hidden = [(*name, limit) for name, limit in limits.items() if name not in {row[:2] for row in sizes}]
     columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
     if limits:
@@ -236,7 +237,9 @@ def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
     ]
 
 
-def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> dict[tuple[str, ...], str]:
+def upper_limits(
+    ranking: Sequence[Candidate], effects: Mapping[str, Effect], pressure_unit: str = "kPa"
+) -> dict[tuple[str, ...], str]:
     """Return one-sided 95 % upper limits by candidate of a ranking and symbol; `effects` are known by name."""
     limits: dict[tuple[str, ...], str] = {}
     for row in ranking:
@@ -247,7 +250,7 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
             if is_finite(largest):
                 short = name.split(".")[-1]
                 symbol, unit = of.get(short) or (short, "SI")
-                shown, factor = display_unit(unit)
+                shown, factor = display_unit(unit, pressure_unit)
                 limits[spaced_name(row.effect), symbol] = f"{number(factor * largest)} {shown}".strip()
     return limits
 

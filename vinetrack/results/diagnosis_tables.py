@@ -42,6 +42,7 @@ class DiagnosisTables:
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
         self.ladder = none if (ladder := diagnosis and diagnosis.ladder) is None else found.get("steps.csv", ladder)
         self.added = listed_names(diagnosis.effects if diagnosis else ())
+        self.pressure_unit = diagnosis.pressure_unit if diagnosis else "kPa"
         self.drift = found.get("drift_groups.csv", none)
         self.learned_force = found.get("learned_force.csv", none)
         self.ranking = diagnosis.candidates() if diagnosis else none
