@@ -114,7 +114,8 @@ def test_line_and_power_law_are_drawn_as_fitted():
         "x_ss_sigma_m_s": [0.05] * 3, "x_ss_over_diameter_1_s": [175.0, 142.0, 116.0],
         "x_ss_over_diameter_sigma_1_s": [None, 3.0, 3.0], "n_steady": [3, 4, 4], "over_diameter": lines,
     }  # fmt: skip
-    ax = damping_figures.draw_speed_scaling({"steady_speed": [family | lines]}).axes[0]
+    ax = damping_figures.draw_speed_scaling({"steady_speed": [family | lines]}, "psi").axes[0]
+    assert any(text.get_text().startswith("3.481 psi (24 kPa), N = 3") for text in ax.get_legend().get_texts())
     power, line = (curve for curve in ax.lines if len(curve.get_xdata()) == 100)
     assert line.get_ydata() == pytest.approx(0.5 + 0.1 * line.get_xdata())
     assert power.get_ydata() == pytest.approx(0.3 * power.get_xdata() ** 0.7)

@@ -179,10 +179,12 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
     from vinetrack.diagnosis.ladder import comparison_lines
-    from vinetrack.results.folder_layout import Results, read_fit, read_result
+    from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 
     fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
-    content = compared.to_dict("records")
+    content, diagnosis = compared.to_dict("records"), read_diagnosis(Results(results))
+    if diagnosis is not None and diagnosis.contradicted_columns:
+        return [str(diagnosis), "", *comparison_lines(compared)], content
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"], content
     return [*comparison_lines(compared), *(f"! {message}" for message in fit.messages)], content

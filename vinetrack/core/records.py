@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.units import AMBIENT_PRESSURE_PA
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, pressure_text
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -120,6 +120,11 @@ class Trial:
         if shared in ("vine", "specimen"):
             return f"{self.vine}, {self.specimen}" if shared == "specimen" and self.specimen else self.vine
         return f"{shared} {value}" if (value := getattr(self, shared, "")) else ""
+
+    @property
+    def yield_group(self) -> str:
+        """Vine and stated yield pressure: trials with one P_y, where a vine has several."""
+        return f"{self.vine}, {pressure_text(self.yield_pressure_Pa, self.pressure_unit, 6)}"
 
     @property
     def area_m2(self) -> float:

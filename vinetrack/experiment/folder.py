@@ -18,6 +18,7 @@ import numpy as np
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import Correction, Floats, Trial
+from vinetrack.core.units import pressure_text
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
@@ -492,9 +493,10 @@ def _check_track(trial: Trial) -> list[Problem]:
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
         remarks["backwards"] = "runs backwards: position should grow as the vine does"
     if track.pressure_Pa is not None and trial.pressure_Pa > 0:
-        highest_kPa, stated_kPa = float(np.max(track.pressure_Pa)) / 1000, trial.pressure_Pa / 1000
-        if not 0.5 < highest_kPa / stated_kPa < 2:
-            remarks["pressure"] = f"has pressures up to {highest_kPa:.4g} kPa, but the sheet says {stated_kPa:g} kPa"
+        highest_Pa = float(np.max(track.pressure_Pa))
+        if not 0.5 < highest_Pa / trial.pressure_Pa < 2:
+            found, stated = (pressure_text(of_Pa, trial.pressure_unit, 4) for of_Pa in (highest_Pa, trial.pressure_Pa))
+            remarks["pressure"] = f"has pressures up to {found}, but the sheet says {stated}"
     return [Problem(code, message, severity="warning", **place) for code, message in remarks.items()]
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, read_table, safe_join
+from vinetrack.core.units import pressure_text
 from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
@@ -128,8 +129,9 @@ class Row:
                 self.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
             return
         if yield_pressure >= pressure:
-            message = f"is not below the pressure of {pressure:g} kPa, so the vine would not grow"
-            message += " (psi? 1 psi is 6.895 kPa)"
+            stated = pressure_text(1e3 * pressure, self.pressure_unit, 6)
+            message = f"is not below the pressure of {stated}, so the vine would not grow"
+            message += " (psi? 1 psi is 6.895 kPa)" if self.pressure_unit == "kPa" else ""
             self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
         if pressure > 0 and yield_pressure == 0 and not self.values.get("yield_pressure_sigma_kPa"):
             message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"

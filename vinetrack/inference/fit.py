@@ -234,8 +234,7 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
     """
     theta, places = layout.start, np.full(len(layout.free), -1)
     trial = trial_data.trial
-    stated = f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"
-    groups = {"", trial.vine, trial.group("day"), stated}
+    groups = {"", trial.vine, trial.group("day"), trial.yield_group}
     for k, free in enumerate(layout.free):
         for place, number in enumerate(fit.numbers):
             if number.key == free.key and number.vine in groups:
@@ -399,10 +398,10 @@ def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
 
 def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
     """The trial with the fitted yield pressure of its vine, if the fit has one."""
-    stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
+    trial = trial_data.trial
     for number in fit.numbers:
-        if number.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated):
-            return replace(trial_data, trial=replace(trial_data.trial, yield_pressure_Pa=number.value))
+        if number.key == YIELD_PRESSURE and number.vine in (trial.vine, trial.yield_group):
+            return replace(trial_data, trial=replace(trial, yield_pressure_Pa=number.value))
     return trial_data
 
 

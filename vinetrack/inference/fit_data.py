@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import InputError, UserError
 from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
+from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
     Smoothing,
@@ -169,9 +170,11 @@ def prepare_trial(
     noise_m, correlation = position_noise(time_s, position_m)
     noise_m = max(noise_m, rounding_m)
     if track.pressure_Pa is None and _cannot_be_driven(trial):
+        stated, least = (
+            pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in (trial.pressure_Pa, trial.yield_pressure_Pa)
+        )
         raise FitError(
-            f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
-            f" {trial.yield_pressure_Pa / 1e3:g} kPa, yet it moves: correct the sheet"
+            f"its pressure, {stated}, lies below the yield pressure, {least}, yet it moves: correct the sheet"
         )
     if trial.payload_kg == 0 and not trial.linear_density_kg_m > 0:
         raise FitError("it has no mass: fill in payload_g, the mass of a body that moves as a whole")
@@ -381,11 +384,12 @@ def not_measured(pairs: Pairs) -> dict[str, str]:
         set_Pa = [trial.pressure_Pa for trial in trials]
         # 1.1: ratio of pressures that a gauge tells apart (chosen)
         if max(set_Pa) > 1.1 * min(set_Pa) or (is_noisy and min(set_Pa) > 1.1 * largest_Pa):
-            said = f"its recorded pressure stands at {largest_Pa / 1e3:g} kPa to the last digit, the sheet says"
-            reasons |= {
-                trial.name: f"{said} {trial.pressure_Pa / 1e3:g}: the end of the gauge's range? Blank its trace"
-                for trial in trials
-            }
+            for trial in trials:
+                end, stated = (
+                    pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in (largest_Pa, trial.pressure_Pa)
+                )
+                said = f"its recorded pressure stands at {end} to the last digit, the sheet says {stated}"
+                reasons[trial.name] = f"{said}: the end of the gauge's range? Blank its trace"
     return reasons
 
 

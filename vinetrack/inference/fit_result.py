@@ -302,7 +302,7 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreePa
             numbers.append(
                 FreeParameter(
                     key=YIELD_PRESSURE,
-                    vine=f"{trial.vine}, {stated_Pa / 1e3:g} kPa" if trial.vine in several else trial.vine,
+                    vine=trial.yield_group if trial.vine in several else trial.vine,
                     symbol="P_y",
                     unit="Pa",
                     start=stated_Pa,

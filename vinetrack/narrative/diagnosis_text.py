@@ -215,7 +215,10 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors."""
     if not diagnosis.rounds:
         return diagnosis.explanation
-    lines = [verdict_line(diagnosis), *table_lines(diagnosis), "", diagnosis.explanation]
+    lines = [verdict_line(diagnosis), *table_lines(diagnosis)]
+    if diagnosis.contradicted_columns:  # all else rests on the sheet
+        return "\n".join(lines)
+    lines += ["", diagnosis.explanation]
     for step in diagnosis.rounds:
         if step.ranking:
             lines += ["", f"{' + '.join(step.model)}: {step.verdict}", *_ranking(step)]
@@ -236,7 +239,9 @@ def table_lines(diagnosis: Diagnosis, in_short: bool = False) -> list[str]:
     lines = [f"  {first.note}"] if first.note else []
     for row in rows:
         most = (2 if row.question.startswith(("F =", "What to do")) else 1) if in_short else None
-        texts = (row.answer,) if in_short else (row.answer, row.note)
+        texts = [row.answer] if in_short else [row.answer, row.note]
+        while most and len(texts[0]) > most * (116 - width) and "; " in texts[0]:  # whole clauses, where there are any
+            texts[0] = texts[0].rpartition("; ")[0]
         told = [line for text in texts for line in textwrap.wrap(text, 116 - width, max_lines=most, placeholder=" …")]
         lines += [f"  {'' if k else row.question:<{width}}  {line}" for k, line in enumerate(told)]
     return lines
@@ -440,9 +445,10 @@ def _size_text(trial: Trial) -> str:
     return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {pressure}"
 
 
-def value_in_unit(value: float, unit: str) -> str:
+def value_in_unit(value: float, unit: str, pressure_unit: str = "kPa") -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
-    return "never" if math.isinf(value) else number(value * display_unit(unit, table=units.PREDICTION_UNITS)[1])
+    factor = display_unit(unit, pressure_unit, units.PREDICTION_UNITS)[1]
+    return "never" if math.isinf(value) else number(value * factor)
 
 
 def speed_band_text(share: Band) -> str:
@@ -468,6 +474,7 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "word": lambda count: ("two", "three", "four", "five")[count - 2],
     "changes": _changes,
     "remedy": lambda source: SHARED_REMEDIES[source],
+    "pressure": lambda pressure_in: pressure_text(*pressure_in),
     "condition": lambda condition: _condition_text(**condition),
     "variables": _variables_text,
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",

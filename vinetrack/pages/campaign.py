@@ -212,7 +212,7 @@ def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
         trial = aligned.data.trial
         yield_Pa = trial.yield_pressure_Pa
         # Fitted by vine, and by stated value if a vine has several
-        for group in (trial.vine, f"{trial.vine}, {yield_Pa / 1e3:g} kPa"):
+        for group in (trial.vine, trial.yield_group):
             yield_Pa = choice.numbers.get(f"{YIELD_PRESSURE}[{group}]", yield_Pa)
         data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
     predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)

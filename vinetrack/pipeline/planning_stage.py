@@ -118,6 +118,8 @@ def read_basis(
     if results is not None:
         summary, heading = choose_fit(results, anyway)
         fit = FitNumbers(summary, results.as_posix())
+    if sheet is not None and (sheet / PROVENANCE).exists():
+        raise ResultsError(f"{sheet} holds results: predict from their fit with --fit {sheet}, and the vine by options")
     if sheet is None:
         planned = planned_trial(cells, needed=needed)
     else:
@@ -180,9 +182,10 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     rows = []
     for one in inputs.bands():
         if one.why.code != "constant":  # constants of nature are left out
-            low, median, high = (value_in_unit(value, one.unit) for value in (one.low, one.median, one.high))
+            in_sheet = inputs.trial.pressure_unit
+            low, median, high = (value_in_unit(value, one.unit, in_sheet) for value in (one.low, one.median, one.high))
             band = "–" if one.low == one.high else f"{low} to {high}"
-            rows.append((one.symbol, median, band, display_unit(one.unit, table=PREDICTION_UNITS)[0], str(one.why)))
+            rows.append((one.symbol, median, band, display_unit(one.unit, in_sheet, PREDICTION_UNITS)[0], str(one.why)))
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     columns = ("prediction", "at y/L", "median", "90 % band", "unit")

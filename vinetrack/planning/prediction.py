@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import AMBIENT_PRESSURE_PA
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, display_unit
 from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
@@ -144,12 +144,13 @@ class VinePrediction:
         inputs, trial = self.inputs, self.inputs.trial
         stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
         if stress > 0.9 * BURST_STRESS_PA:
-            highest_kPa = trial.pressure_Pa / 1e3 * BURST_STRESS_PA / stress
-            facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
+            highest = trial.pressure_Pa * BURST_STRESS_PA / stress, trial.pressure_unit
+            facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "highest": highest}
             yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
-        low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
-        if median >= trial.pressure_Pa / 1e3:
-            yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
+        given = trial.pressure_Pa, *np.quantile(inputs.draw(2000, 1)[YIELD], BAND).tolist()
+        if given[0] <= given[2]:
+            shown = zip(("pressure", "low", "middle", "high"), given, strict=True)
+            yield remark("below_yield", **{name: (at_Pa, trial.pressure_unit) for name, at_Pa in shown})
         elif self.arrives < 1 - warned_from:
             yield remark("stalls", share=1 - self.arrives)
         if self.slack >= warned_from and trial.tail_slack == "free":
@@ -189,7 +190,8 @@ class VinePrediction:
                 (final,) = final_speeds(model, [trial], self.at_fraction, host=host).tolist()
             except EffectError:
                 continue
-            words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
+            shown = ((p.symbol, value, *display_unit(p.unit, trial.pressure_unit)) for p, value in sizes.items())
+            words = [f"{symbol} = {factor * value:.3g} {unit}".rstrip() for symbol, value, unit, factor in shown]
             neglected_effects.append(Neglected(name, ", ".join(words), final, without))
         return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
 

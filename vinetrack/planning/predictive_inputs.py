@@ -440,22 +440,23 @@ class _Assembly:
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
             place = place if abs(stated - fit.fit.numbers[place].value) <= max(tolerance, 1.0) else None
-        printed_kPa = YIELD_PRESSURE_KPA
+        printed_Pa = 1000 * YIELD_PRESSURE_KPA
         if place is not None:
             self.set_fitted(YIELD, place)
         elif math.isfinite(stated):
             self.set(YIELD, stated, "given")
-            why = remark("P_y_stated", kPa=sigma / 1e3)
+            why = remark("P_y_stated", sigma=(sigma, trial.pressure_unit))
             self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
         elif self.printed_scale == 4:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
-            self.set(YIELD, 1000 * printed_kPa, "printed", source=SOURCE)
-            why = remark("P_y_printed", kPa=rounding_Pa / 1e3)
+            self.set(YIELD, printed_Pa, "printed", source=SOURCE)
+            why = remark("P_y_printed", sigma=(rounding_Pa, trial.pressure_unit))
             self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
-            self.set(YIELD, 1000 * printed_kPa, "P_y_guessed")
+            self.set(YIELD, printed_Pa, "P_y_guessed")
             sigma = math.log(3.0) / 1.6448536269514722  # nine of ten vines within a factor of 3
-            self.vary(YIELD, sigma, "guess of P_y", "P_y guess", remark("P_y_guess", kPa=printed_kPa), log=True)
+            why = remark("P_y_guess", printed=(printed_Pa, trial.pressure_unit))
+            self.vary(YIELD, sigma, "guess of P_y", "P_y guess", why, log=True)
 
     def other_parameters(self, model: Model) -> None:
         """Parameters of all other effects: as stated, as fitted, or at their typical size."""
@@ -613,7 +614,7 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
                 f"looks like {what}: the measured speeds imply {number(as_stated, 2)} times the damping of tubes of "
                 f"this size, and {number(ratio, 2)} times {how}"
             )
-            place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa", "severity": "warning"}
+            place: dict[str, Any] = {"file": "trials.csv", "column": f"pressure_{stated}", "severity": "warning"}
             return [Problem(message=message, remedy=remedy, **place)]
     return []
 
