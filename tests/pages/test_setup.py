@@ -106,8 +106,8 @@ ROWS = [
     {"trial": "d15_30kPa_1", "video": "d15 30kPa 1.mp4"},
     {"trial": "late", "video": "monday/d15 36kPa 1.mov"},
 ]
-EXPECTED = {(0, "pressure_kPa"): "24.1317", (0, "payload_g"): "0", (1, "pressure_kPa"): "31.0264",
-            (1, "payload_g"): "20", (2, "pressure_kPa"): "36.5422", (2, "payload_g"): "5"}  # fmt: skip
+EXPECTED = {(0, "pressure_psi"): "3.5", (0, "payload_g"): "0", (1, "pressure_psi"): "4.5",
+            (1, "payload_g"): "20", (2, "pressure_psi"): "5.3", (2, "payload_g"): "5"}  # fmt: skip
 
 
 def changed(text: str, at_row: int | str = 0, at_column: str = "trial", decimal: str = ".") -> dict[tuple, str]:
@@ -157,9 +157,17 @@ def test_cells_of_notes_may_have_units_and_headings_further_words():
     for mark in ("\t", ", "):
         placed, told = draft.place_block("Yield 0.5 psi.\n" + table.replace("|", mark), columns, ROWS, 0, "trial")
         assert (set(placed), len(told)) == (expected, 2)
-    assert changed("late 5.3 psi", 0, "pressure_kPa") == {(2, "pressure_kPa"): "36.5422"}
+    assert changed("late 5.3 psi", 0, "pressure_kPa") == {(2, "pressure_psi"): "5.3"}
     assert changed("clip\tpressure\nlate\t5 furlong") == {}
     assert notes("clip\tpressure\nlate\t5 furlong") == 1
+
+
+def test_an_empty_column_takes_the_unit_of_the_notes_and_a_bare_number_that_of_the_others():
+    table = "late\t5.3 psi\nd15_24kPa_1\t3.5"
+    assert changed(table, 0, "pressure_kPa") == {(2, "pressure_psi"): "5.3", (0, "pressure_psi"): "3.5"}
+    rows = [ROWS[0], ROWS[1] | {"pressure_kPa": "30"}, ROWS[2]]
+    placed, _ = draft.place_block(table, COLUMNS, rows, 0, "pressure_kPa")
+    assert placed == [(2, "pressure_kPa", "36.5422"), (0, "pressure_kPa", "24.1317")]
 
 
 def test_what_matches_nothing_is_named_and_changes_nothing():

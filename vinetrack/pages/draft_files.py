@@ -319,6 +319,7 @@ def place_block(
     follow the one pasted into, and without names its rows the row pasted into.
     """
     placed: list[tuple[int | str, str, str]] = []
+    given: dict[str, list[tuple[int | str, str, str]]] = {}
     notes: list[str] = []
     words, row_named = _header_words(columns), _rows_by_name(rows)
 
@@ -335,7 +336,7 @@ def place_block(
     # A header has at least two known words: a sentence may have one, such as psi.
     table = table - 1 - known[::-1].index(max(known)) if max(known, default=0) > 1 else table
     if table:
-        notes.append(f"{table} line{'s'[: table > 1]} above the table: left out.")
+        notes.append(f"Left out, above the table: {' / '.join(lines[:table])}")
     block = read_block("\n".join(lines[table:]))
     first = block[0] if block else []
     header = [column_named(word) for word in first]
@@ -372,11 +373,16 @@ def place_block(
             continue
         for name, cell in zip(header, cells, strict=False):
             if cell and name and name != "trial":
-                column = column_of(name, columns)
                 try:
-                    placed.append((row, column, in_unit_of(column, name, cell, decimal)))
+                    given.setdefault(name, []).append((row, cell, value_and_unit(cell, name)[1]))
                 except InputError as error:
                     notes.append(f"“{cell}” {error}: left out.")
+    for name, cells in given.items():
+        # A number without a unit has that of the others; a column in which nothing stands takes it over.
+        column, said = column_of(name, columns), {unit for _, _, unit in cells if unit}
+        name = f"{quantity(name)}_{said.pop()}" if len(said) == 1 else name
+        column = column if any(row.get(column) for row in rows) else name
+        placed += [(row, column, in_unit_of(column, name, cell, decimal)) for row, cell, _ in cells]
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
     if name_place is not None and placed and without:
         notes.append(f"No line for {', '.join(without)}: left as they are.")

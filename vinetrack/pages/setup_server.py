@@ -6,6 +6,7 @@ import base64
 import json
 import logging
 import math
+import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -269,7 +270,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         known |= dict.fromkeys(other_units(name), known[name])
     return {
         "name": folder.resolve().name,
-        "folder": str(folder),
+        "next": shlex.join(["vinetrack", "run", str(folder)]),
         "stamp": draft.stamp,
         "known": known,
         "units": {key: unit.text for key, unit in UNITS.items()},

@@ -24,7 +24,7 @@ function showState() {
   const words = [];
   if (warnings) words.push(`${warnings} ${warnings === 1 ? "warning" : "warnings"}`);
   words.push(state.dirty ? "not saved" : "saved as shown");
-  if (!errors && !state.dirty) words.push(`next: vinetrack run ${state.folder}`);
+  if (!errors && !state.dirty) words.push(`next: ${state.next}`);
   $("status").textContent = words.join(" · ");
   $("save").disabled = !state.dirty;
 }

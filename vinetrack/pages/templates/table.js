@@ -111,20 +111,24 @@ async function propose(block, column, row) {
   const at_row = row === "shared" ? row : Number(row);
   let placed;
   try {
-    placed = await ask("api/paste", {...block, columns: shownColumns(), rows, at_row, at_column: column, decimal: decimal || "."});
+    placed = await ask("api/paste", {...block, columns: shownColumns(), rows: rows.map((one) => ({...one, ...state.shared})), at_row, at_column: column, decimal: decimal || "."});
   } catch (error) {
     placed = {cells: [], notes: [error.message]};
   }
-  const {cells} = placed;
+  const valueNow = (at, name) => (at === "shared" ? sharedValue(name) : rows[at][name]) ?? "";
+  const cells = placed.cells.filter(([at, name, value]) => valueNow(at, name) !== value);
   $("pasted").replaceChildren(...listed(placed.notes.map((text) => ({severity: "warning", text}))));
   $("preview").hidden = !cells.length;
   $("changes").replaceChildren(...cells.map(([at, name, value]) => {
-    const now = (at === "shared" ? sharedValue(name) : rows[at][name]) || "blank";
-    return el("tr", {}, ...[at === "shared" ? "All trials" : rows[at].trial, name.replaceAll("_", " "), now, "→", value].map((text) => el("td", {}, text)));
+    return el("tr", {}, ...[at === "shared" ? "All trials" : rows[at].trial, name.replaceAll("_", " "), valueNow(at, name) || "blank", "→", value].map((text) => el("td", {}, text)));
   }));
   $("put-in").textContent = `Fill in ${cells.length} cells`;
   $("put-in").onclick = () => {
-    before = structuredClone({sheet: state.sheet, shared: state.shared});
+    before = structuredClone({sheet: state.sheet, shared: state.shared, kept: state.kept, offered: state.offered});
+    for (const name of new Set(cells.map((one) => one[1]))) {
+      const shown = shownColumns().find((one) => quantityOf(one) === quantityOf(name)) ?? name;
+      if (shown !== name) setUnit(shown, name.slice(quantityOf(name).length + 1));
+    }
     for (const [at, name, value] of cells) {
       if (at === "shared") state.shared[sharedKey(name) ?? name] = value;
       else setCell(state.sheet.rows[at], name, value);
