@@ -177,6 +177,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
         answer_set=step.answer_names,
         ranking=tuple(_ranking(step, not_testable)),
         explanation=in_words(step),
+        slips=step.slips,
         cosines=Cosines(names, cosines.tolist()),
         fit=tests.fit,
         fits={

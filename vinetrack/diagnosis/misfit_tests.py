@@ -172,9 +172,9 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
 
 def slip_of(parameter: Parameter, value: float, sigma: float) -> tuple[float, str] | None:
     """The size that a common slip in the sheet produces, and what was done, where a fitted size is that up to an
-    ordinary error; None where no slip fits.
+    ordinary error; None where no slip fits, or an ordinary error alone would do.
     """
-    if parameter.plausible is None:
+    if parameter.plausible is None or parameter.plausible[0] <= value <= parameter.plausible[1]:
         return None
     low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
     for size, action in parameter.slips:

@@ -330,6 +330,7 @@ class Round(JsonRecord):
     sets: tuple[tuple[str, ...], ...] = ()
     partial: tuple[StoredCandidate, ...] = ()
     explanation: str = ""
+    slips: Mapping[str, str] = field(default_factory=dict)
     ranking: tuple[StoredCandidate, ...] = ()
     cosines: Cosines = Cosines()
     fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None

@@ -44,6 +44,7 @@ from vinetrack.diagnosis.misfit_tests import (
     has_excess_scatter,
     misfit_tests,
     plausible_range,
+    slip_of,
 )
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
 from vinetrack.dynamics.model import Model
@@ -362,6 +363,17 @@ class SelectionStep:
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
+
+    @property
+    def slips(self) -> dict[str, str]:
+        """The slips in the sheet that would produce the fitted sizes of the answer set, each with its effect."""
+        found: dict[str, str] = {}
+        for hypothesis in self.answer_set:
+            parameters = {f"{effect.name}.{p.name}": p for effect in hypothesis.effects for p in effect.parameters}
+            for entry in hypothesis.numbers:
+                if entry.key in parameters and (slip := slip_of(parameters[entry.key], entry.value, entry.sigma)):
+                    found.setdefault(slip[1], entry.key.split(".")[0])
+        return found
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[SelectionStep]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import InputError, UserError
+from vinetrack.core.problems import InputError, UserError, joined
 from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
 from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
@@ -339,7 +339,8 @@ def pairs_of(
             pairs.append((trial, tracks[trial.name]))
             continue
         if trial.track is None:
-            left_out[trial.name] = "its recording has not been tracked: run `vinetrack run`, or give its track"
+            remedy = "run `vinetrack run`, or give its track" if tracks is None else "`trials.csv` has the reason"
+            left_out[trial.name] = f"its recording has not been tracked: {remedy}"
             continue
         try:
             pairs.append((trial, correct_frames(load_track(trial))))
@@ -352,8 +353,9 @@ def pairs_of(
 
 def none_to_fit(left_out: Mapping[str, str]) -> FitError:
     """The error of an experiment without a trial to fit; `left_out` are the reasons, by name of trial."""
-    reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-    return FitError(f"No trial can be fitted: {reasons or 'there is none'}.")
+    alike = {why: [name for name, other in left_out.items() if other == why] for why in left_out.values()}
+    reasons = [f"{joined(names if len(names) < 5 else [*names[:3], 'others'])}: {why}" for why, names in alike.items()]
+    return FitError(f"No trial can be fitted: {'; '.join(reasons) or 'there is none'}.")
 
 
 # ------------------------------------------------------------------------------

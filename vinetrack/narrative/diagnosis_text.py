@@ -293,6 +293,10 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     was, now = ({(one.title, one.shown[0]): value_text(one) for one in fit.numbers} for fit in (before, after))
     body = [(title, was.get((title, unit), "–"), now.get((title, unit), "–"), unit) for title, unit in was | now]
     lines += table(body, ("", "before", "after", "unit"), align="<>><")
+    errors = ladder["rms_left_out_m"].tolist()
+    if errors[-1] >= errors[0] and gain > 9.0:
+        facts = {"name": after.model.names[-1], "without_m": errors[0], "with_m": errors[-1]}
+        lines.append(f"! {sentence('left_out_error_does_not_fall', facts)}")
     return lines + [f"! {message}" for message in after.messages]
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
 from vinetrack.diagnosis.between_trials import BETWEEN, ORDER_DRIFT, SPECIMEN
-from vinetrack.diagnosis.misfit_tests import slip_of
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -264,19 +263,23 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
         return "", ""
     if power.wary or not power.effects:
         return "sizes that trials would detect were not computed", str(power.wary)
-    at_largest = {entry.effect: entry.probability_at(entry.largest) for entry in power.effects}
-    physical = [entry.effect for entry in power.effects if entry.kind == "physical"] or at_largest
-    # 0.1: power below which an effect counts as undetectable (chosen)
-    undetectable = [*dict.fromkeys([*(name for name in physical if at_largest[name] < 0.1), *power.not_testable])]
-    # 6: undetectable effects that are named, at most (chosen)
-    named = [*undetectable[:6], *(["others"] if len(undetectable) > 6 else [])]
-    note = f"not even then: {listed_names(named)}" if named else ""
-    seen = sum(probability >= 0.9 for probability in at_largest.values())
-    facts = {"seen": seen, "count": len(power.effects) + len(power.not_testable)}
-    return sentence("smaller_effects", facts), note
+    missed = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
+    unseen = [*missed, *power.not_testable]
+    facts = {"seen": len(power.effects) - len(missed), "count": len(power.effects) + len(power.not_testable)}
+    return sentence("smaller_effects", facts), f"not even then: {listed_names(unseen)}" if unseen else ""
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
+    """What to check first: a slip in the sheet that would look so; else the next step. And the rest beside it."""
+    step, more = _next_step(diagnosis)
+    slips = {slip: name for entry in diagnosis.rounds for slip, name in entry.slips.items()}
+    if diagnosis.contradicted_columns or not slips:
+        return step, more
+    first = [f"check first whether {slip}: {spaced_name(name)} has that size" for slip, name in slips.items()]
+    return "; ".join(first), " ".join(filter(None, (f"If not: {step.rstrip('.')}.", more)))
+
+
+def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
     """The next step, and how the effects in question are measured or reduced."""
     verdict, last = diagnosis.verdict, diagnosis.final_verdict
     if diagnosis.contradicted_columns:
@@ -422,7 +425,10 @@ def explain(step: SelectionStep) -> str:
     if step.note:
         note = str(step.note)
         text += f" {note[0].upper()}{note[1:]} ({' and '.join(best.names)} together do)."
-    text += f"{_slips(answers)}{remedies_in_words(step)}"
+    text += "".join(
+        f" {name} has the size that results if {slip}: check that first." for slip, name in step.slips.items()
+    )
+    text += remedies_in_words(step)
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
     if verdict == ARTEFACT and (others := best.names[1:]):
@@ -441,22 +447,6 @@ def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
     facts: dict[str, Any] = {"added": added, "sizes": sizes_in_words(last.numbers)}
     facts |= {"before": step.tests.fit.chi2_per_dof, "after": last.fit.chi2_per_dof}
     return f"{text} {sentence('a_part_is_explained', facts)}"
-
-
-def _slips(answers: Sequence[LikelihoodRatio]) -> str:
-    """Name the slips in the sheet that would produce the fitted sizes of an answer set; blank where none would."""
-    effect_of_slip: dict[str, str] = {}
-    for hypothesis in answers:
-        parameters = {f"{effect.name}.{p.name}": p for effect in hypothesis.effects for p in effect.parameters}
-        for entry in hypothesis.numbers:
-            parameter = parameters.get(entry.key)
-            low, high = (parameter and parameter.plausible) or (math.nan, math.nan)
-            # An ordinary error is likelier than a slip beside it.
-            if parameter and not low <= entry.value <= high and (slip := slip_of(parameter, entry.value, entry.sigma)):
-                effect_of_slip.setdefault(slip[1], entry.key.split(".")[0])
-    return "".join(
-        f" {name} has the size that results if {slip}: check that first." for slip, name in effect_of_slip.items()
-    )
 
 
 def _with_the_fault(step: SelectionStep) -> str:
