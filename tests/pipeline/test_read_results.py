@@ -134,6 +134,10 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     former.to_csv(results.ladder, index=False)
     now = former[1:].assign(added="").reset_index(drop=True)
     assert drawn.all_steps(results, now)["added"].tolist() == ["", "leak"]
+    results.kept_steps.parent.mkdir()
+    drawn.all_steps(results, now).to_csv(results.kept_steps, index=False)
+    results.ladder.unlink()  # as a run does before it writes it again
+    assert drawn.all_steps(results, now)["added"].tolist() == ["", "leak"]
     assert drawn.all_steps(results, now.assign(rms_in_sample_m=1.0))["added"].tolist() == [""], "of other trials"
     read = replace(read_diagnosis(results), ladder=now)
     assert len(drawn.DiagnosisTables(read, tables={"steps.csv": drawn.all_steps(results, now)}).ladder) == 2

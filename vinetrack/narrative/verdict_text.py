@@ -24,7 +24,7 @@ from vinetrack.diagnosis.result import (
     UNEXPLAINED,
     Confounder,
 )
-from vinetrack.effects import catalogue
+from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.narrative import sentence
@@ -208,13 +208,13 @@ def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
-    """Sizes of what was added, else of the members of the answer set."""
-    if diagnosis.effects:
-        added = [p for p in diagnosis.parameters if p.key.split(".")[0] in diagnosis.effects]
-        wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in added]
-        return ", ".join(map(split_estimate, added)), "; ".join([*wider, *_shared_remedies(added)])
-    members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
-    return "; ".join(f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]), ""
+    """Sizes of what is in the model beyond its base, and where nothing was added of the members of the answer set."""
+    beyond = [p for p in diagnosis.parameters if p.key.split(".")[0] not in BASE_EFFECTS]
+    wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in beyond]
+    members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers and not diagnosis.effects]
+    sizes = [f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]]
+    answer = "; ".join(filter(None, (", ".join(map(split_estimate, beyond)), *sizes)))
+    return answer, "; ".join([*wider, *_shared_remedies(beyond)])
 
 
 def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:

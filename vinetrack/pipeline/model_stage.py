@@ -197,6 +197,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
+    write_csv(results.kept_steps, tables["steps.csv"])
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, ladder)

@@ -125,7 +125,7 @@ def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    former = next((read_result(path) for path in (results.steps, results.ladder) if path.exists()), ladder[:0])
+    former = next((read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0])
     known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
     for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
         if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):

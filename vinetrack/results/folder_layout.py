@@ -104,6 +104,7 @@ class Results:
     diagnosis = _File("diagnosis.json")  # The diagnosis of the model in use
     ladder = _File("ladder.csv")  # Errors of the initial model and of each later model
     steps = _File("diagnosis", "steps.csv")  # The ladder, below the steps of earlier runs to the model in use
+    kept_steps = _File(".kept", "steps.csv")  # The same, where a run does not begin by deleting it
     final_fit = _File("diagnosis", "final_fit.json")  # The fit with all added effects; exists only if there are any
     overlays = _File("overlays")  # Folder of the clips
     provenance = _File("provenance.json")  # Versions, settings and hashes of all inputs
