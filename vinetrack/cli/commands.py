@@ -333,7 +333,8 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
 
     check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))
-    lines = str(power).splitlines()
+    head, *lines = str(power).splitlines()
+    lines = [f"{head}; what a fit absorbs is counted, which the linear theory of a verdict does not", *lines]
     if figure is not None:
         write_figure(power.plot(), figure)
         lines.append(f"Figure: {figure}")

@@ -266,7 +266,9 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
     missed = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
     unseen = [*missed, *power.not_testable]
     facts = {"seen": len(power.effects) - len(missed), "count": len(power.effects) + len(power.not_testable)}
-    return sentence("smaller_effects", facts), f"not even then: {listed_names(unseen)}" if unseen else ""
+    # 6: effects that are named, at most (chosen)
+    named = unseen if len(unseen) <= 6 else [*unseen[:5], f"{len(unseen) - 5} others"]
+    return sentence("smaller_effects", facts), f"not even then: {listed_names(named)}" if named else ""
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:

@@ -270,8 +270,8 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         problems.append(Problem("longer_than_stated", str(longer), "length_mm", severity="warning", file=SHEET))
     speeds = [(trial, entry.mean_speed_m_s) for trial, entry in surveyor.facts.items()]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
-    # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
-    if not any(problem.severity == "error" for problem in problems):
+    # The plausibility of a pressure depends on sizes and positions, so it is tested only if these have no errors.
+    if not any(problem.severity == "error" or problem.code == "longer_than_the_vine" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
         problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
     lines = facts_rows(entries, list(surveyor.facts)) if entries else []
