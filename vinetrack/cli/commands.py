@@ -338,8 +338,8 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     if figure is not None:
         write_figure(power.plot(), figure)
         lines.append(f"Figure: {figure}")
-    if rows_file is not None and power.further:
-        write_csv(rows_file, pd.DataFrame(sheet_rows(power)))
+    if rows_file is not None and (rows := sheet_rows(power)):
+        write_csv(rows_file, pd.DataFrame(rows))
         lines.append(f"Rows of the sheet: {rows_file}")
     return lines, power.to_json()
 
