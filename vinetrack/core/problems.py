@@ -120,6 +120,13 @@ def joined(names: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
+def reasons_told(left_out: Mapping[str, str]) -> str:
+    """The reasons by name of trial, each once with those that share it."""
+    alike = {why: [name for name, other in left_out.items() if other == why] for why in left_out.values()}
+    named = {why: names if len(names) < 5 else [*names[:3], "others"] for why, names in alike.items()}
+    return "; ".join(f"{joined(names)}: {why}" for why, names in named.items())
+
+
 @dataclass(frozen=True)
 class Remark:
     """A code, and the names and numbers (SI) that belong to it. Blank and false without a code; as text, a sentence."""

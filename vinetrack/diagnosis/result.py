@@ -17,7 +17,6 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 from vinetrack.core.problems import Remark, in_words
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.terminal import Printed, plot
-from vinetrack.core.units import display_unit
 from vinetrack.inference.fit_result import Fit, Number, OrNaN, or_open
 
 if TYPE_CHECKING:
@@ -57,11 +56,6 @@ class EffectPower(JsonRecord):
     taken_for: Mapping[str, OrNaN] = field(default_factory=dict)
     other_values: tuple[float, ...] = ()
     pressure_unit: str = "kPa"
-
-    @property
-    def shown(self) -> tuple[str, float]:
-        """The unit in which people read its sizes, and the factor from SI."""
-        return display_unit(self.unit, self.pressure_unit)
 
     def size_at(self, probability: float) -> float:
         """The value of the parameter at which the effect is detected with this probability. Returns SI; infinite where

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import InputError, UserError, joined
+from vinetrack.core.problems import InputError, UserError, reasons_told
 from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
 from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
@@ -353,9 +353,7 @@ def pairs_of(
 
 def none_to_fit(left_out: Mapping[str, str]) -> FitError:
     """The error of an experiment without a trial to fit; `left_out` are the reasons, by name of trial."""
-    alike = {why: [name for name, other in left_out.items() if other == why] for why in left_out.values()}
-    reasons = [f"{joined(names if len(names) < 5 else [*names[:3], 'others'])}: {why}" for why, names in alike.items()]
-    return FitError(f"No trial can be fitted: {'; '.join(reasons) or 'there is none'}.")
+    return FitError(f"No trial can be fitted: {reasons_told(left_out) or 'there is none'}.")
 
 
 # ------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def size_text(power: EffectPower, value: float) -> str:
     """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none."""
     if not math.isfinite(value):
         return "–"
-    unit, factor = power.shown
+    unit, factor = display_unit(power.unit, power.pressure_unit)
     return f"{number(factor * value, 2)} {unit}".strip()
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.problems import UserError, reasons_told
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.ladder import rms_of
@@ -143,8 +143,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     pairs, _ = measured_trials(experiment, results)
     data, left_out = prepare(pairs, weighted=False)
     if not data:
-        why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
-        raise ResultsError(f"{folder} has no trial to explore: {why}")
+        raise ResultsError(f"{folder} has no trial to explore: {reasons_told(left_out) or 'every trial failed'}")
     stored = read_fit(results)
     highest_m: dict[str, float] = {}
     if not stored.refused:

@@ -565,7 +565,7 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
     name, _, size = text.partition("=")
     if name in power.not_testable:
         return name, math.nan
-    known = {entry.effect: entry.shown for entry in power.effects}
+    known = {entry.effect: display_unit(entry.unit, entry.pressure_unit) for entry in power.effects}
     if name not in known:
         candidates = sorted([*known, *power.not_testable])
         close = difflib.get_close_matches(name, candidates, 1, 0.6)
