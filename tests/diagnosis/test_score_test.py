@@ -172,7 +172,7 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     blocks = np.swapaxes(columns, 1, 2) @ columns
     places = np.tile([0, 1], (12, 1))
     arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
-    problem = SimpleNamespace(index=places, places_of_pairs=np.tile([0, 1, 2, 4, 5, 6, 8, 9, 10], 12), **arrays)
+    problem = SimpleNamespace(index=places, **arrays)
     products = SimpleNamespace(problem=problem, n_unknowns=2, without_trial_effects=lambda _: blocks)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
     found = misfit_tests.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)

@@ -68,7 +68,7 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     frame, state = given(n_trials, count, keys, spread, release_origin_precision=np.full((n_trials, 2), flat_sd**-2))
     state = replace(state, trial_effects=effects)
     part = marginal.marginal(crossed(columns), frame, state)
-    found = marginal.deviance(part, frame, state, state.spread, restricted=False)
+    found = marginal.deviances(part, frame, state, np.array([state.spread]), restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
     for c in columns:
@@ -79,7 +79,7 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     best = np.linalg.solve(square, slope)
     left = [(c[:, 6] - c[:, 4:6] @ best, v) for c, v in zip(columns, dense, strict=True)]
     direct = -2 * sum(multivariate_normal(np.zeros(count), v).logpdf(residual) for residual, v in left)
-    assert found == pytest.approx(direct, rel=1e-8)
+    assert found == pytest.approx([direct], rel=1e-8)
 
 
 def test_residuals_at_zero_deviations_are_restored():
@@ -127,7 +127,8 @@ def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = given(4, 20, 2, 0.5)
     part = marginal.marginal(crossed(columns), frame, state)
-    restricted, plain = (marginal.deviance(part, frame, state, state.spread, restricted=how) for how in (True, False))
+    spreads = np.array([state.spread])
+    restricted, plain = (marginal.deviances(part, frame, state, spreads, restricted=how)[0] for how in (True, False))
     known = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
     assert restricted - plain == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
 

@@ -30,7 +30,7 @@ from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, groups_of
-from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
+from vinetrack.inference.marginal_likelihood import deviances, estimate_between_trial_sd, marginal
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
 from vinetrack.inference.systematics import with_unknowns
@@ -288,7 +288,7 @@ def _deviance(solution: Solution, base: Solution, spread: tuple[float, float] | 
     part = marginal(solution.cross_products, problem, state)
     if spread is None:
         spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
-    return deviance(part, problem, state, spread, restricted=False)
+    return float(deviances(part, problem, state, np.array([spread]), restricted=False)[0])
 
 
 def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:

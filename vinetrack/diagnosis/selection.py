@@ -111,9 +111,11 @@ class Search:
         """
         tests, effects = (self.tests_after(base.fit), base.effects) if base else (self.tests, ())
         gains = {name: tests.predicted_gain(name) for name in dict.fromkeys(tests.products.effects)}
-        names, of_base = sorted(gains, key=lambda name: -gains[name]), frozenset(effect.name for effect in effects)
+        # By significance: of several sizes, or sizes that scatter, chance gains more.
+        names, of_base = sorted(gains, key=lambda name: -tests.best_z(name)), frozenset(one.name for one in effects)
         if not every:
-            names = [name for name in names if gains[name] > MIN_SHARE_OF_BEST_PREDICTION * gains[names[0]]][:most]
+            least = MIN_SHARE_OF_BEST_PREDICTION * max(gains.values(), default=0.0)
+            names = [name for name in names if gains[name] > least][:most]
         for name in names:
             if (of_base, name) not in self.tried:
                 self.tried.add((of_base, name))
@@ -413,7 +415,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
             return nothing_found()
         if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(with_curves(best.fit)))):
             continue
-        if is_significant(best):
+        if any(map(is_significant, answer_set(hypotheses)[0])):
             adequate, rejected, after = adequate_hypotheses(hypotheses, search)
             if after is not None:
                 return _rounds(search, hypotheses, adequate, rejected, after)
@@ -422,7 +424,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
 
     # Sets of effects.
     credible = [hypothesis for hypothesis in search.of_size(1) if hypothesis.credible]
-    if not credible or not is_significant(best_of(credible)):
+    if not any(map(is_significant, answer_set(credible)[0] if credible else ())):
         # A score that no refit confirms counts only if another test rejects the model too.
         hypotheses = search.of_size(1)
         return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else ADEQUATE)
@@ -447,7 +449,7 @@ def _effect_set_rounds(search: Search) -> list[SelectionStep]:
         adequate, of_these, after = adequate_hypotheses(of_this_size, search)
         rejected |= of_these
         if after is not None:
-            if search.is_better(adequate[0]):
+            if any(map(search.is_better, adequate)):
                 return _rounds(search, tuple(search.fitted.values()), adequate, rejected, after)
             rejected[adequate[0].label] = remark("gain_within_chance")
         if not search.is_better(of_this_size[0]):

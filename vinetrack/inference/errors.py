@@ -24,9 +24,7 @@ from vinetrack.inference.marginal_likelihood import (
     inverse_of_block,
     levenberg_marquardt_step,
     log_likelihood,
-    marginal,
     matrix_root,
-    normal_equations,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import (
@@ -76,8 +74,8 @@ class Precision:
 
 def precision(solution: Solution) -> Precision:
     """Covariance at the end of a fit, from the model of noise and between-trial variation."""
-    problem, state = solution.problem, solution.state
-    information = normal_equations(marginal(solution.cross_products, problem, state), problem, state, state.spread)[0]
+    problem = solution.problem
+    information = trial_information(solution)[0].sum(axis=0) + np.diag(problem.prior_precision)
     diagonal = np.diag(information)
     insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
     k = np.flatnonzero(problem.free & ~insensitive)

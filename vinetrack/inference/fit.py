@@ -555,7 +555,9 @@ def refit(
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
-    values = {number.name: number.value for number in before.numbers}
+    # Those where its trajectories ended: the quoted ones are a step further, that of the systematic errors.
+    known = before.predictor.layout
+    values = dict(zip((number.name for number in known.free), known.values(before.solution.state.theta), strict=True))
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))

@@ -6,9 +6,9 @@ Between-trial standard deviations and noise maximise the restricted likelihood (
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,6 +135,48 @@ def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, fl
     return left, log_det
 
 
+@njit(nogil=True, error_model="numpy")
+def added_up(
+    blocks: Floats, index: NDArray[np.int_], prior_precision: Floats, deviation: Floats
+) -> tuple[Floats, Floats, float]:
+    """`summed` of blocks, given the deviations of the parameters from the means of their priors, (n_free,)."""
+    square, slope, keys = np.diag(prior_precision), -prior_precision * deviation, index.shape[1]
+    total = np.sum(prior_precision * deviation**2)
+    for i in range(len(blocks)):
+        for u in range(keys):
+            if index[i, u] >= 0:
+                slope[index[i, u]] += blocks[i, u, keys]
+                for v in range(keys):
+                    if index[i, v] >= 0:
+                        square[index[i, u], index[i, v]] += blocks[i, u, v]
+        total += blocks[i, keys, keys]
+    return square, slope, total
+
+
+@njit(nogil=True, error_model="numpy")
+def profiled(
+    blocks: Floats, deviation_sd: Floats, index: NDArray[np.int_], prior_precision: Floats, deviation: Floats,
+    below: Floats, above: Floats, free: NDArray[np.bool_], random: NDArray[np.bool_], restricted: bool,
+) -> Floats:  # fmt: skip
+    """`deviances`, without their constant. Shapes: deviation_sd (n, n_trials, 2) → (n,)."""
+    deviances = np.empty(len(deviation_sd))
+    for k in range(len(deviation_sd)):
+        left, log_det = without_deviations(blocks, deviation_sd[k])
+        square, slope, total = added_up(left, index, prior_precision, deviation)
+        # A parameter at its bound must not be credited with the decrease beyond the bound.
+        step, moving = step_within_bounds(square, slope, below, above, free)
+        deviances[k] = total + log_det - np.sum(step * (2 * slope - square @ step))
+        # Random effects w of groups of trials are integrated out. With w ~ N(0, D²) and M the information of the data
+        # on w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is det(D (M + D⁻²) D)^(−½). So a hypothesis with
+        # many groups is penalised for each of them.
+        counted = np.flatnonzero(moving if restricted else moving & random)
+        if counted.size:
+            deviances[k] += np.linalg.slogdet(square[counted][:, counted])[1]
+        if not restricted:
+            deviances[k] -= np.sum(np.log(prior_precision[counted]))
+    return deviances
+
+
 def noise_at_correlations(
     cross_products: Floats,
     prior_precision: Floats,
@@ -210,15 +252,6 @@ class MixedProblem:
         arrays = "index has_deviation gauge_error release_origin_mean release_origin_precision points stretches"
         return replace(self, **{name: getattr(self, name)[trials] for name in arrays.split()})
 
-    @cached_property
-    def places_of_pairs(self) -> NDArray[np.int_]:
-        """Places of all pairs of a trial's keys and residual in a flattened matrix of the n_free parameters, the
-        residual, and what belongs to none.
-        """
-        size = self.prior_mean.size + 2
-        places = np.pad(self.index, ((0, 0), (0, 1)), constant_values=size - 2) % size
-        return (places[:, :, None] * size + places[:, None, :]).ravel()
-
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
     """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
@@ -231,13 +264,12 @@ def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, 
     return centre, precision
 
 
-def trial_deviation_sd(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
+def trial_deviation_sd(problem: MixedProblem, spread: Floats | tuple[float, float]) -> Floats:
     """Standard deviations of the deviations of pressure and ln B of each trial. Returns the gauge's error in place of
-    the first for a measured pressure. Shape (n_trials, 2).
+    the first for a measured pressure. Shapes: spread (..., 2) → (..., n_trials, 2).
     """
-    sd = np.empty((problem.gauge_error.size, 2))
-    sd[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, spread[0])
-    sd[:, 1] = spread[1]
+    sd = np.repeat(np.asarray(spread, dtype=float)[..., None, :], problem.gauge_error.size, axis=-2)
+    sd[..., 0] = np.where(problem.gauge_error > 0, problem.gauge_error, sd[..., 0])
     return sd
 
 
@@ -257,10 +289,7 @@ def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats
     Returns information, slope (half the negative gradient of the sum of squares), square (the penalised sum of
     squares). Shapes: blocks (n_trials, n_keys + 1, n_keys + 1); theta (n_free,).
     """
-    size, prior, deviation = theta.size + 2, problem.prior_precision, theta - problem.prior_mean
-    total = np.asarray(np.bincount(problem.places_of_pairs, blocks.ravel(), size**2), dtype=float).reshape(size, size)
-    square = float(total[-2, -2] + np.sum(prior * deviation**2))
-    return total[:-2, :-2] + np.diag(prior), total[:-2, -2] - prior * deviation, square
+    return added_up(blocks, problem.index, problem.prior_precision, theta - problem.prior_mean)  # type: ignore[no-any-return]
 
 
 def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
@@ -411,9 +440,9 @@ def bounded_solve(
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
 
-# Noise correlations that are tried (chosen). Up to 0.97, which is 30 frames: what stays longer is misfit, and a random
+# Least and largest noise correlation (chosen). Up to 0.97, 30 frames: what stays longer is misfit, and a random
 # walk would take up any. Slow errors of tracks are systematic ones.
-CORRELATIONS = np.concatenate([np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97]])
+CORRELATIONS = (-0.5, 0.97)
 
 
 @dataclass(frozen=True)
@@ -446,34 +475,22 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     return Marginal(eliminated(white, precision)[0], constant)
 
 
-def normal_equations(
-    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
-) -> tuple[Floats, Floats, float, float]:
-    """Normal equations of the free parameters at given between-trial standard deviations, as `summed` returns them, and
-    the sum over trials of ln det(I + S Z S).
+def deviances(
+    part: Marginal,
+    problem: MixedProblem,
+    state: FitState,
+    spreads: Floats,
+    *,
+    restricted: bool = True,
+) -> Floats:
+    """−2 ln of the (restricted) likelihood at each of several between-trial standard deviations, profiled over the
+    parameters. Shapes: spreads (n, 2) → (n,).
     """
-    blocks, log_det = without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
-    return *summed(blocks, problem, state.theta), log_det
-
-
-def deviance(
-    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
-) -> float:
-    """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters."""
-    information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    # A parameter at its bound must not be credited with the decrease beyond the bound.
-    step, moving = bounded_solve(information, slope, problem, state.theta)
-    total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
-    if restricted:
-        return total + float(np.linalg.slogdet(information[np.ix_(moving, moving)])[1])
-    k = np.flatnonzero(moving & problem.random)
-    if k.size:
-        # Random effects w of groups of trials are integrated out. With w ~ N(0, D²) and M the information of the data
-        # on w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is det(D (M + D⁻²) D)^(−½). So a hypothesis with
-        # many groups is penalised for each of them.
-        sd = 1 / np.sqrt(problem.prior_precision[k])
-        total += float(np.linalg.slogdet(sd[:, None] * information[np.ix_(k, k)] * sd)[1])
-    return total
+    sd = trial_deviation_sd(problem, spreads) * problem.has_deviation
+    prior, theta = problem.prior_precision, state.theta
+    room = theta - problem.lower, problem.upper - theta, problem.free, problem.random
+    found = profiled(part.blocks, sd, problem.index, prior, theta - problem.prior_mean, *room, restricted)
+    return np.asarray(found + part.log_constant)
 
 
 def estimate_between_trial_sd(
@@ -484,38 +501,32 @@ def estimate_between_trial_sd(
     *,
     restricted: bool = True,
 ) -> tuple[float, float]:
-    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood. The likelihood may have
-    two maxima, since pressure and B can explain the same variation. So the search starts from the best of a grid and
-    the current values.
+    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search. The
+    likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from the
+    best of a grid and the current values; these stay where others are hardly likelier, since along the valley between
+    pressure and B the maximum moves far with every step of a fit.
     """
-    from scipy.optimize import minimize
-
-    which = [k for k in range(2) if estimable[k]]
-    if not which:
+    if not any(estimable):
         return state.spread
-    least, largest = math.log(LEAST_BETWEEN_TRIAL_SD), [math.log(upper) for upper in LARGEST_SPREAD]
+    largest = np.where(estimable, LARGEST_SPREAD, np.inf)
 
-    def at(logs: Floats) -> tuple[float, float]:
-        spread = list(state.spread)
-        for k, value in zip(which, logs.tolist(), strict=True):
-            # Clipped before the exponential: on a flat likelihood the simplex may go arbitrarily far.
-            spread[k] = math.exp(min(max(value, least), largest[k]))
-        return spread[0], spread[1]
+    def best_of(spreads: Floats) -> tuple[Floats, float]:
+        spreads = np.where(estimable, np.clip(spreads, LEAST_BETWEEN_TRIAL_SD, largest), state.spread)
+        found = deviances(part, problem, state, spreads, restricted=restricted)
+        return spreads[np.argmin(found)], float(found.min())
 
-    def cost(logs: Floats) -> float:
-        return deviance(part, problem, state, at(logs), restricted=restricted)
-
-    start_point = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
+    current, at_current = best_of(np.array([state.spread]))
     # Standard deviations from which the maximum of the likelihood is searched (chosen)
-    axes = np.meshgrid(*[np.log((0.001, 0.004, 0.01, 0.025, 0.06))] * len(which), indexing="ij")
-    points = [start_point, *np.column_stack([axis.ravel() for axis in axes])]
-    start = points[int(np.argmin([cost(point) for point in points]))]
-    # The simplex extends towards smaller values: at the upper bound a step up would be clipped and degenerate.
-    simplex = np.vstack([start, start - 0.4 * np.eye(len(which))])
-    minimum = minimize(
-        cost, start, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-3}
-    )
-    return at(minimum.x)
+    grid = np.array(list(itertools.product((0.001, 0.004, 0.01, 0.025, 0.06), repeat=2)))
+    best, lowest = min((current, at_current), best_of(grid), key=lambda found: found[1])
+    # 0.4, 5e-3, 1e-3: logarithms of the first and the last ratio of standard deviations that are compared, and decrease
+    # of −2 ln L that counts (chosen)
+    reach, ways = 0.4, np.array(list(itertools.product((-1, 0, 1), repeat=2)))
+    while reach > 5e-3:
+        there, value = best_of(best * np.exp(reach * ways))
+        best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-3 else (best, lowest, 0.5 * reach)
+    # 0.01: decrease of −2 ln L from which other standard deviations count as likelier (derived)
+    return (float(best[0]), float(best[1])) if lowest < at_current - 0.01 else state.spread
 
 
 def log_likelihood(
@@ -524,7 +535,7 @@ def log_likelihood(
     """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models."""
     part = marginal(cross_products, problem, state)
     spread = estimate_between_trial_sd(part, problem, state, estimable, restricted=False)
-    return -0.5 * deviance(part, problem, state, spread, restricted=False)
+    return -0.5 * float(deviances(part, problem, state, np.array([spread]), restricted=False)[0])
 
 
 def matrix_root(square: Floats) -> Floats:
@@ -541,23 +552,29 @@ def estimate_noise(
     much as the differences between trials are due to chance. Returns rho, variance. Shapes: cross_products (n_trials,
     3, k, k) → (n_trials,).
     """
-    grid = CORRELATIONS if rho is None else np.array([rho])
     centre, precision = trial_effect_prior(problem, state)
     precision_scaled = precision * state.variance[:, None]
     prior_gradient = precision_scaled * (state.trial_effects - centre)
     columns = [*range(problem.n_effects), cross_products.shape[-1] - 1]
-    scores, squares, degrees = noise_at_correlations(
-        cross_products[:, :, columns][:, :, :, columns],
-        precision_scaled,
-        prior_gradient,
-        problem.points,
-        grid,
-        np.count_nonzero(problem.free) / problem.index.shape[0],
-    )
-    scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
-    best = int(np.argmin(scores))
+    of_effects = cross_products[:, :, columns][:, :, :, columns]
+    shared = np.count_nonzero(problem.free) / problem.index.shape[0]
+
+    def at(rhos: Floats) -> tuple[Floats, Floats, Floats]:
+        scores, *noise = noise_at_correlations(
+            of_effects, precision_scaled, prior_gradient, problem.points, rhos, shared
+        )
+        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), *noise
+
     if rho is None:
-        return estimate_noise(cross_products, problem, state, _parabola_minimum(grid, scores, best))
+        low, high = CORRELATIONS
+        # 3, 12: rounds of a search for the correlation, each between the neighbours of the best one of so many (chosen)
+        for _ in range(3):
+            grid = np.linspace(low, high, 12)
+            scores = at(grid)[0]
+            best = int(np.argmin(scores))
+            low, high = grid[max(best - 1, 0)], grid[min(best + 1, 11)]
+        rho = _parabola_minimum(grid, scores, best)
+    _, squares, degrees = at(np.array([rho]))
     return rho, _shrink_to_common(squares[0], degrees[0])
 
 

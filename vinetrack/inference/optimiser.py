@@ -18,11 +18,9 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import (
-    CORRELATIONS,
-    LARGEST_SPREAD,
     FitState,
     MixedProblem,
-    deviance,
+    deviances,
     estimate_between_trial_sd,
     estimate_noise,
     levenberg_marquardt_step,
@@ -206,7 +204,7 @@ class Solution:
     def deviance(self, *, restricted: bool = True) -> float:
         """−2 ln of the (restricted) likelihood at the state."""
         part = marginal(self.cross_products, self.problem, self.state)
-        return deviance(part, self.problem, self.state, self.state.spread, restricted=restricted)
+        return float(deviances(part, self.problem, self.state, np.array([self.state.spread]), restricted=restricted)[0])
 
     def log_likelihood(self) -> float:
         """`marginal_likelihood.log_likelihood` at the state."""
@@ -260,8 +258,6 @@ def solve(
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
         state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
-        if state.rho == CORRELATIONS[-1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
-            break  # They have taken it up.
         variances_moved = variance_change(before, state)
         damping_before = damping
         (step, effect_step, predicted_decrease), damping = _next_step(
