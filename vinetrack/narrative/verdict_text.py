@@ -207,9 +207,16 @@ def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
     return table[~table["partial"].astype(bool)] if "partial" in table else table
 
 
+def _settled(diagnosis: Diagnosis) -> tuple[Sequence[Number], str]:
+    """Parameters of the last model, fitted together with the fault of the measurement that remains, and its name."""
+    last = diagnosis.rounds[-1]
+    faults = [row for row in last.ranking if row.in_answer_set and row.along and last.verdict == ARTEFACT]
+    return (faults[0].along, faults[0].effect) if len(faults) == 1 else (diagnosis.parameters, "")
+
+
 def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     """Sizes of what is in the model beyond its base, and where nothing was added of the members of the answer set."""
-    beyond = [p for p in diagnosis.parameters if p.key.split(".")[0] not in BASE_EFFECTS]
+    beyond = [p for p in _settled(diagnosis)[0] if p.key.split(".")[0] not in BASE_EFFECTS]
     wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in beyond]
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers and not diagnosis.effects]
     sizes = [f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]]
@@ -219,13 +226,14 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     """Exponent n and B of the last model."""
-    law = [p for p in diagnosis.parameters if p.key in (EXPONENT, DAMPING) and is_finite(p.value)]
+    numbers, fault = _settled(diagnosis)
+    law = [p for p in numbers if p.key in (EXPONENT, DAMPING) and is_finite(p.value)]
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
-    with_them = [f"with {listed_names(diagnosis.effects)} in the model"] if law and diagnosis.effects else []
-    with_them += (
-        ["of a model that these trials refute"] if law and diagnosis.final_verdict not in (ADEQUATE, "") else []
-    )
+    known = listed_names([*diagnosis.effects, *filter(None, [fault])])
+    with_them = [f"with {known} in the model"] if law and known else []
+    refuted = law and not fault and diagnosis.final_verdict not in (ADEQUATE, "")
+    with_them += ["of a model that these trials refute"] if refuted else []
     notes = [*(f"n 95 %: {bounds_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
