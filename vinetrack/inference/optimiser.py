@@ -18,6 +18,8 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import (
+    CORRELATIONS,
+    LARGEST_SPREAD,
     FitState,
     MixedProblem,
     deviances,
@@ -258,22 +260,17 @@ def solve(
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
         state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
+        if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
+            break  # They have taken it up.
         variances_moved = variance_change(before, state)
         damping_before = damping
         (step, effect_step, predicted_decrease), damping = _next_step(
             cross_products, problem, state, damping, least_decrease
         )
-        is_full_instead = damping_before > damping
+        is_full_instead, predictor.is_central = damping_before > damping, predicted_decrease < far_decrease
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
-        # A step did not do what it promised: one-sided differences may promise what second derivatives mimic.
-        # 10.0: promised decrease of −2 ln L from which differences become central; at corners it is less (chosen)
-        one_sided = predicted_decrease > 10.0 and not predictor.is_central
-        if at_corner and one_sided:
-            predictor.is_central, at_corner, damping = True, False, 0.0
-            columns, cross_products = _linearise(predictor, state)
-            continue
         small_step = predicted_decrease < least_decrease or at_corner
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
@@ -295,9 +292,7 @@ def solve(
         if accepted is None:
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
             # step should gain much, it is no minimum, but nothing more can be done.
-            if one_sided:
-                at_corner = True
-            elif variances_moved < CONVERGED_VARIANCES:
+            if variances_moved < CONVERGED_VARIANCES:
                 converged = predicted_decrease < far_decrease
                 break
             continue

@@ -299,10 +299,11 @@ class Predictor:
 
     def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
-        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
+        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1). One-sided differences make steps promise what
+        no trajectory keeps, since second derivatives are in them: they are for trial effects alone, and far from a fit.
         """
-        unperturbed = self.jobs(theta, trial_effects)
-        sides, at = ((1, -1) if self.is_central else (1,)), (unperturbed, theta, trial_effects, trial_effects_only)
+        unperturbed, central = self.jobs(theta, trial_effects), self.is_central and not trial_effects_only
+        sides, at = ((1, -1) if central else (1,)), (unperturbed, theta, trial_effects, trial_effects_only)
         perturbations = [one for side in sides for one in self._perturbations(*at, side)]
         motions = self._simulated(Jobs.concatenated([unperturbed, *(jobs for _, _, jobs in perturbations)]))
         count = len(self.data)
