@@ -4,7 +4,8 @@
 
 Recordings: the demonstration's conditions, repeated until there are so many, grown and filmed anew. Their films are
 decoded alone, then `vinetrack run` is timed on the folder; with the fewest recordings also after one pressure in the
-sheet was changed, and once more when nothing was. Tracks: a campaign of `benchmarks/hidden/` of this kind, likewise.
+sheet was changed, and once more when nothing was. Model and diagnosis are timed once more alone, for their part in the
+whole. Tracks: a campaign of `benchmarks/hidden/` of this kind, likewise.
 
 A row for each run: its seconds, those of its steps, processor seconds and peak memory of the largest of its processes,
 files written, recordings tracked, verdict. The last lines are the ratios that do not depend on the machine. The first
@@ -110,7 +111,7 @@ def show(what: str, used: Run, results: Path | None = None, tracked: int = 0, ve
 
 def of_recordings(counts: list[int], cores: int, folder: Path) -> None:
     """The rows of recordings, and the ratios of the largest number below 200 to the smallest."""
-    first: dict[int, tuple[float, float]] = {}
+    first: dict[int, tuple[float, float, float]] = {}
     for count in sorted(counts):
         experiment, results = folder / f"films_{count}", folder / "results"
         film(count, experiment, cores)
@@ -125,12 +126,15 @@ def of_recordings(counts: list[int], cores: int, folder: Path) -> None:
             new = set(kept.glob("*.track")) - tracks
             tracks |= new
             show(f"{count} recordings, {what}", used, results / experiment.name, len(new), verdict)
-            first.setdefault(count, (used.processor_s, decoding.processor_s))
+            if count not in first:
+                model = timed("-m", "vinetrack.cli.main", "model", experiment, results / experiment.name)
+                show(f"{count} recordings, model and diagnosis alone", model)
+                first[count] = used.processor_s, model.processor_s, decoding.processor_s
     for few, many in zip(sorted(first), sorted(first)[1:], strict=False):
-        further_s = (first[many][0] - first[few][0]) / (many - few)
-        decoded_s = (first[many][1] - first[few][1]) / (many - few)
-        print(f"a further recording, {few} to {many}: {further_s:.2f} processor s, of which decoding {decoded_s:.3f}")
-        print(f"chain over decoding alone, {many}: {first[many][0] / first[many][1]:.1f}", flush=True)
+        whole, model_s, decoded = ((b - a) / (many - few) for a, b in zip(first[few], first[many], strict=True))
+        print(f"a further recording, {few} to {many}: {whole:.2f} processor s, model and diagnosis {model_s:.2f};")
+        print(f"    from film to figure {whole - model_s:.2f}, of which decoding {decoded:.3f}")
+        print(f"chain over decoding alone, {many}: {first[many][0] / first[many][2]:.1f}", flush=True)
 
 
 def main() -> None:

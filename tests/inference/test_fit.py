@@ -415,13 +415,15 @@ def test_yield_pressures_without_error_are_no_parameters(campaign):
 
 @pytest.mark.slow
 def test_film_influence_agrees_with_refits_with_heavier_film():
-    pairs = small_campaign(11, damping=5e-3, pressure=1e-3)[0]
-    fit = vt.fit(vt.base_model(), pairs, profile=False)
+    """At given scatter of the trials, which another film would be taken for in part."""
+    spreads = (1e-3, 5e-3)
+    pairs = small_campaign(11, damping=spreads[1], pressure=spreads[0])[0]
+    fit = vt.fit(vt.base_model(), pairs, spreads=spreads, profile=False)
     squares = np.zeros(len(fit.numbers))
     for vine in dict.fromkeys(trial.vine for trial, _ in pairs):
         densities = [trial.film_density_kg_m3 * (1 + FILM_ERROR * (trial.vine == vine)) for trial, _ in pairs]
         heavier = [(replace(t, film_density_kg_m3=d), x) for (t, x), d in zip(pairs, densities, strict=True)]
-        other = vt.fit(vt.base_model(), heavier, profile=False)
+        other = vt.fit(vt.base_model(), heavier, spreads=spreads, profile=False)
         squares += np.square([b.value - a.value for a, b in zip(fit.numbers, other.numbers, strict=True)])
     moved, by_refit = vt.film_influence(fit), np.sqrt(squares)
     of_law = [k for k, number in enumerate(fit.numbers) if number.key.startswith("eversion_damping")]

@@ -138,12 +138,14 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
     rounds = tuple(_to_round(step, not_testable) for step in steps)
     explanation = " ".join(finished.explanation for finished in rounds)
     lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
-    if lack_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
-        explanation += " " + str(remark("not_tried", names=lack_columns))
+    not_tried = lack_columns if any(finished.verdict == UNEXPLAINED for finished in rounds) else []
+    if not_tried:
+        explanation += " " + str(remark("not_tried", names=not_tried))
     return Diagnosis(
         rounds=rounds,
         effects=tuple(step.answer_names[0] for step in steps[:-1]),
         explanation=explanation,
+        not_tried=tuple(not_tried),
         fits=(fit, *(step.tests.fit for step in steps[1:])),
         power=power_of(steps[-1].tests, not_testable),
     )

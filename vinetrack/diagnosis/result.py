@@ -345,7 +345,7 @@ def _told(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 @dataclass(frozen=True, repr=False)
 class Diagnosis(Printed, JsonRecord):
     """The result of a diagnosis. Printed, it is the text on the terminal. `effects` are those added, in order; `fits`
-    the initial model and every enlarged one.
+    the initial model and every enlarged one; `not_tried` lack what the sheet leaves blank, where nothing explains it.
     """
 
     rounds: tuple[Round, ...] = ()
@@ -363,6 +363,7 @@ class Diagnosis(Printed, JsonRecord):
     learned_table: Annotated[Table | None, Field(exclude=True)] = None
     stored_parameters: Annotated[tuple[Number, ...], Field(alias="parameters")] = ()
     contradicted_columns: tuple[str, ...] = ()
+    not_tried: tuple[str, ...] = ()
     refused: str = ""
     power: StoredPower | None = None
     odd_trials: tuple[str, ...] = ()

@@ -289,7 +289,7 @@ def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats
     Returns information, slope (half the negative gradient of the sum of squares), square (the penalised sum of
     squares). Shapes: blocks (n_trials, n_keys + 1, n_keys + 1); theta (n_free,).
     """
-    return added_up(blocks, problem.index, problem.prior_precision, theta - problem.prior_mean)  # type: ignore[no-any-return]
+    return added_up(blocks, problem.index, problem.prior_precision, theta - problem.prior_mean)
 
 
 def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
@@ -519,12 +519,12 @@ def estimate_between_trial_sd(
     # Standard deviations from which the maximum of the likelihood is searched (chosen)
     grid = np.array(list(itertools.product((0.001, 0.004, 0.01, 0.025, 0.06), repeat=2)))
     best, lowest = min((current, at_current), best_of(grid), key=lambda found: found[1])
-    # 0.4, 5e-3, 1e-3: logarithms of the first and the last ratio of standard deviations that are compared, and decrease
+    # 0.4, 2e-3, 1e-5: logarithms of the first and the last ratio of standard deviations that are compared, and decrease
     # of −2 ln L that counts (chosen)
     reach, ways = 0.4, np.array(list(itertools.product((-1, 0, 1), repeat=2)))
-    while reach > 5e-3:
+    while reach > 2e-3:
         there, value = best_of(best * np.exp(reach * ways))
-        best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-3 else (best, lowest, 0.5 * reach)
+        best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-5 else (best, lowest, 0.5 * reach)
     # 0.01: decrease of −2 ln L from which other standard deviations count as likelier (derived)
     return (float(best[0]), float(best[1])) if lowest < at_current - 0.01 else state.spread
 
@@ -560,30 +560,20 @@ def estimate_noise(
     shared = np.count_nonzero(problem.free) / problem.index.shape[0]
 
     def at(rhos: Floats) -> tuple[Floats, Floats, Floats]:
-        scores, *noise = noise_at_correlations(
-            of_effects, precision_scaled, prior_gradient, problem.points, rhos, shared
-        )
-        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), *noise
+        how = precision_scaled, prior_gradient, problem.points, rhos, shared
+        scores, squares, degrees = noise_at_correlations(of_effects, *how)
+        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), squares, degrees
 
     if rho is None:
         low, high = CORRELATIONS
-        # 3, 12: rounds of a search for the correlation, each between the neighbours of the best one of so many (chosen)
-        for _ in range(3):
+        # 4, 12: rounds of a search for the correlation, each between the neighbours of the best one of so many (chosen)
+        for _ in range(4):
             grid = np.linspace(low, high, 12)
-            scores = at(grid)[0]
-            best = int(np.argmin(scores))
-            low, high = grid[max(best - 1, 0)], grid[min(best + 1, 11)]
-        rho = _parabola_minimum(grid, scores, best)
+            best = int(np.argmin(at(grid)[0]))
+            low, rho, high = grid[max(best - 1, 0)], float(grid[best]), grid[min(best + 1, 11)]
+    assert rho is not None
     _, squares, degrees = at(np.array([rho]))
     return rho, _shrink_to_common(squares[0], degrees[0])
-
-
-def _parabola_minimum(grid: Floats, scores: Floats, best: int) -> float:
-    """Minimum of the parabola through the lowest grid point and its neighbours."""
-    if best in (0, grid.size - 1):
-        return float(grid[best])
-    curve = np.polyfit(grid[best - 1 : best + 2] - grid[best], scores[best - 1 : best + 2], 2)
-    return float(grid[best] - curve[1] / (2 * curve[0]))
 
 
 def _shrink_to_common(square: Floats, dof: Floats) -> Floats:

@@ -299,8 +299,8 @@ class Predictor:
 
     def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
-        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1). One-sided differences make steps promise what
-        no trajectory keeps, since second derivatives are in them: they are for trial effects alone, and far from a fit.
+        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1). One-sided differences hold second
+        derivatives, which promise steps that no trajectory keeps: they are for trial effects alone, and far from a fit.
         """
         unperturbed, central = self.jobs(theta, trial_effects), self.is_central and not trial_effects_only
         sides, at = ((1, -1) if central else (1,)), (unperturbed, theta, trial_effects, trial_effects_only)

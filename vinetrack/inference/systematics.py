@@ -97,8 +97,8 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
             places[i] += own + [-1] * (width - len(own))
             columns[i].append(np.pad(moved_m, ((0, 0), (0, width - len(own)))))
     index = np.array(places, dtype=int).reshape(len(data), -1)
-    own = _gauge_errors(predictor, solution) if "gauge" in sources else [nothing for nothing, *_ in columns]
-    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors], own)
+    alone = _gauge_errors(predictor, solution) if "gauge" in sources else [nothing for nothing, *_ in columns]
+    return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors], alone)
 
 
 def _changes_of(

@@ -377,12 +377,12 @@ def place_block(
                     given.setdefault(name, []).append((row, cell, value_and_unit(cell, name)[1]))
                 except InputError as error:
                     notes.append(f"“{cell}” {error}: left out.")
-    for name, cells in given.items():
+    for name, found in given.items():
         # A number without a unit has that of the others; a column in which nothing stands takes it over.
-        column, said = column_of(name, columns), {unit for _, _, unit in cells if unit}
+        column, said = column_of(name, columns), {unit for _, _, unit in found if unit}
         name = f"{quantity(name)}_{said.pop()}" if len(said) == 1 else name
         column = column if any(row.get(column) for row in rows) else name
-        placed += [(row, column, in_unit_of(column, name, cell, decimal)) for row, cell, _ in cells]
+        placed += [(row, column, in_unit_of(column, name, cell, decimal)) for row, cell, _ in found]
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
     if name_place is not None and placed and without:
         notes.append(f"No line for {', '.join(without)}: left as they are.")

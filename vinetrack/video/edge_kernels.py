@@ -252,6 +252,7 @@ MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read;
 ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
 
 
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def gather(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, reach: np.ndarray, lag: np.ndarray,
     early: np.ndarray, late: np.ndarray, memory_frames: float, appearance: np.ndarray, clip: float, shading: np.ndarray,
@@ -262,33 +263,25 @@ def gather(
     nearest to the passage count most, and film counts from `late` on. Shapes: strip (n_frames, n_across, n_along);
     scale, offset, edge, reach (n_frames,); lag (n_across,); early, late (n_along,).
     """
-    frames = np.arange(len(strip))[:, None]
-    away = np.maximum(np.maximum(early - frames, frames - late), 0.0) / memory_frames
-    weight = np.where(away < MEMORY_CUTOFF, np.exp(-away), 0.0)
-    weights = np.stack([np.where(frames >= late, weight, 0.0), weight]).astype(np.float32)
-    counted = weight > 0
-    limits = np.stack([counted.argmax(axis=1), counted.shape[1] - counted[:, ::-1].argmax(axis=1)], axis=1)
-    limits[~counted.any(axis=1)] = 0
-    sums = np.zeros((2, 3, *strip.shape[1:]), np.float32)
+    n, rows, columns = strip.shape
+    sums = np.zeros((2, 3, rows, columns), np.float32)
+    weights, limits = np.zeros((2, n, columns), np.float32), np.zeros((n, 2), np.int64)
+    for t in range(n):
+        limits[t, 0] = columns
+        for s in range(columns):
+            away = max(early[s] - t, t - late[s], 0.0) / memory_frames
+            if away < MEMORY_CUTOFF:
+                limits[t, 0], limits[t, 1] = min(limits[t, 0], s), s + 1
+                weights[1, t, s] = math.exp(-away)
+                weights[0, t, s] = weights[1, t, s] if t >= late[s] else 0.0
+    centre, unit = (len(shading) - 1) // 2, np.float32(1.0)
     clip_weight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
-    _gather(strip, scale, offset, edge, reach, lag, weights, limits, appearance, clip_weight, shading, sums)
-    return sums
-
-
-@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def _gather(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, reach: np.ndarray, lag: np.ndarray,
-    weights: np.ndarray, limits: np.ndarray, appearance: np.ndarray, clip_weight: np.float32, shading: np.ndarray,
-    sums: np.ndarray,
-) -> None:  # fmt: skip
-    """Add all frames to `sums`; see `gather`."""
-    n, centre, unit = len(strip), (len(shading) - 1) // 2, np.float32(1.0)
-    brightness = np.empty(strip.shape[2], np.float32)
-    for block in range(0, strip.shape[1], ROWS_PER_BLOCK):
+    brightness = np.empty(columns, np.float32)
+    for block in range(0, rows, ROWS_PER_BLOCK):
         for t in range(n):
             first, last = limits[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
-            for u in range(block, min(block + ROWS_PER_BLOCK, strip.shape[1])):
+            for u in range(block, min(block + ROWS_PER_BLOCK, rows) if first < last else block):
                 row_edge = edge[t] - lag[u]
                 behind = min(max(math.ceil(row_edge - reach[t]), first), last)
                 ahead = min(max(math.floor(row_edge + reach[t]) + 1, first), last)
@@ -309,6 +302,7 @@ def _gather(
                         count[i] += w
                         total[i] += w * values[i]
                         squares[i] += w * values[i] * values[i]
+    return sums
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -350,27 +344,22 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def residuals(
+def residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Pixels about the edge, by distance ahead of the whole column of their row's own edge, in the bins of `shading`:
-    residual r, weight (0 where there is no pixel), derivative of the model by the row's lag, and r²/9v, v the mean of
-    both variances, shape (4, n_used, n_across, n_distances). And the part of a column by which the
-    edge lies further, (n_used, n_across). Shapes: fit (n_frames, 6); frames (n_used,).
+) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
+    """Sums over the pixels about the edge of what a fit leaves, r, with the weights w of the fit. Of each row, w r d
+    and w d², with d the derivative of the model by the row's lag, shape (2, n_across); at each distance ahead of the
+    row's own edge, in the bins of `shading`, w r and w, (2, n_distances): a pixel counts in the two bins between which
+    it lies; and the mean of log(1 + r²/9v), v the mean of both variances. Shapes: fit (n_frames, 6); frames (n_used,).
     """
     _, rows, columns = strip.shape
-    out, fractions = np.zeros((4, len(frames), rows, len(shading)), np.float32), np.zeros((len(frames), rows))
+    of_rows, of_distances, total, count = np.zeros((2, rows)), np.zeros((2, len(shading))), 0.0, 0
     unit, ninth, shading32 = np.float32(1.0), np.float32(1 / 9), shading.astype(np.float32)
-    for used in range(len(frames)):
-        t = frames[used]
+    weight, weighted, factors = np.empty((3, columns), np.float32)
+    for t in frames:
         y, length = fit[t, 0], lengths[t]
-        gain, level, factor, dark = (
-            np.float32(1 + fit[t, 3]),
-            np.float32(fit[t, 4]),
-            np.float32(scale[t]),
-            np.float32(offset[t]),
-        )
+        gain, shift, factor, dark = np.float32(1 + fit[t, 3]), np.float32(fit[t, 4]), scale[t], offset[t]
         half = coverage_reach(length, blur) + margin
         table, middle = coverage_table(length, blur, half).astype(np.float32), math.ceil(half) + 1
         first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
@@ -378,7 +367,6 @@ def residuals(
             row_edge = y - lag[u]
             whole_px, j, table_fraction = subpixel_index(row_edge)
             a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
-            fractions[used, u] = row_edge - whole_px
             if b <= a:
                 continue
             k, m, d = a - whole_px + middle, b - a, a - whole_px + (len(shading) - 1) // 2
@@ -388,15 +376,32 @@ def residuals(
             values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
             film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
             shade_before, shade_after = shading32[d - 1 : d - 1 + m], shading32[d : d + m]
-            residual, weight = out[0, used, u, d : d + m], out[1, used, u, d : d + m]
-            slope, square = out[2, used, u, d : d + m], out[3, used, u, d : d + m]
+            by_slope = known = np.float32(0.0)
             for i in range(m):
                 p, contrast = low[i] + f * (high[i] - low[i]), film[i] - background[i]
-                modelled = background[i] + contrast * (gain * p + level)
+                modelled = background[i] + contrast * (gain * p + shift)
                 modelled += shade_after[i] + fraction * (shade_before[i] - shade_after[i])
-                r = np.float32(values[i]) * factor + dark - modelled
+                r = np.float32(values[i]) * np.float32(factor) + np.float32(dark) - modelled
                 variance = p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
-                residual[i], weight[i] = r, unit / (variance + r * r * ninth)
-                slope[i] = -contrast * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
-                square[i] = np.float32(2.0) * ninth * r * r / (film_variance[i] + background_variance[i])
-    return out, fractions
+                w = unit / (variance + r * r * ninth)
+                slope = -contrast * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
+                by_slope += w * r * slope
+                known += w * slope * slope
+                weight[i], weighted[i] = w, w * r
+                factors[i] = unit + np.float32(2.0) * ninth * r * r / (film_variance[i] + background_variance[i])
+            of_rows[0, u] += by_slope
+            of_rows[1, u] += known
+            for share, at in ((unit - fraction, d), (fraction, d - 1)):
+                residual_here, weight_here = of_distances[0, at : at + m], of_distances[1, at : at + m]
+                for i in range(m):
+                    residual_here[i] += share * weighted[i]
+                    weight_here[i] += share * weight[i]
+            count += m
+            product = 1.0
+            for i in range(m):  # one logarithm for many pixels
+                product *= factors[i]
+                if product > 1e200:
+                    total += math.log(product)
+                    product = 1.0
+            total += math.log(product)
+    return of_rows, of_distances, total / max(count, 1)

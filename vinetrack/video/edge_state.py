@@ -156,26 +156,18 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
     return padded
 
 
-def residuals(
+def residual_sums(
     strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX
-) -> tuple[NDArray[np.float32], Floats]:
-    """What a fit leaves in the frames of `use`; see `edge_kernels.residuals`. Shapes: fit (n_frames, 6); use
-    (n_frames,).
+) -> tuple[Floats, Floats, float]:
+    """What a fit leaves in the frames of `use`, by rows, by distances, and its robust misfit, in which a wider blur
+    would not lower its own; see `edge_kernels.residual_sums`. Shapes: fit (n_frames, 6); use (n_frames,).
     """
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
-    return kernels.residuals(
+    return kernels.residual_sums(
         strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
         margin_px, frames, shading,
     )  # fmt: skip
-
-
-def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> float:
-    """Return the robust misfit of a fit, the mean of log(1 + r²/9v). v does not depend on the blur: a wider one would
-    lower its own misfit.
-    """
-    (_, weight, _, square), _ = residuals(strip, state, fit, use, margin_px)
-    return float(np.log(1 + square).sum(dtype=float) / max(np.count_nonzero(weight), 1))
 
 
 # ------------------------------------------------------------------------------
@@ -195,8 +187,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        (residual, weight, slope, _), _ = residuals(strip, state, fit, slow)
-        slope_of_row, known = ((weight * slope * factor).sum(axis=(0, 2), dtype=float) for factor in (residual, slope))
+        (slope_of_row, known), *_ = residual_sums(strip, state, fit, slow)
         step = slope_of_row / (known + 0.02 * float(known.max()) + 1e-9)
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
         lag, lead = _smooth_lag(state.lag + step, known)
@@ -206,14 +197,18 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     candidates = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])  # Blurs that are tried, px (chosen)
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
-    misfits = []
-    for blur in candidates.tolist():  # each with a new fit: a blur must not be judged by edges fitted with another
-        blurred = replace(state, blur=blur)
-        fit = fit_edges(strip, blurred, np.isin(np.arange(len(state.edge)), sampled), EARLY_FIT_ROUNDS)
-        use = np.isfinite(fit[:, 0])
-        blurred = replace(blurred, edge=np.where(use, fit[:, 0], state.edge))
-        misfits.append(misfit(strip, blurred, fit, use, widest - coverage_reach(0.0, blur)))
-    return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
+    misfits = np.full(len(candidates), np.inf)
+    least = int(np.argmin(np.abs(candidates - state.blur)))
+    while not np.isfinite(misfits[max(least - 1, 0) : least + 2]).all():  # down to the least, from the blur until now
+        for k in range(max(least - 1, 0), min(least + 2, len(candidates))):
+            # Each with a new fit: a blur must not be judged by edges fitted with another.
+            blurred = replace(state, blur=float(candidates[k]))
+            fit = fit_edges(strip, blurred, np.isin(np.arange(len(state.edge)), sampled), EARLY_FIT_ROUNDS)
+            use = np.isfinite(fit[:, 0])
+            blurred = replace(blurred, edge=np.where(use, fit[:, 0], state.edge))
+            misfits[k] = residual_sums(strip, blurred, fit, use, widest - coverage_reach(0.0, blurred.blur))[2]
+        least = int(np.argmin(misfits))
+    return replace(state, blur=float(np.clip(_least_misfit(candidates, misfits), *OPTICAL_BLUR_PX)))
 
 
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
@@ -223,13 +218,7 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        (residual, weight, *_), fraction = residuals(strip, state, fit, core)
-        # The row's edge lies between two whole columns: each pixel counts in two bins.
-        sums = np.zeros((2, weight.shape[2]))
-        for total, part in zip(sums, (weight * residual, weight), strict=True):
-            ahead = np.einsum("tu,tud->d", fraction, part)
-            total[:] = part.sum(axis=(0, 1), dtype=float) - ahead
-            total[:-1] += ahead[1:]
+        _, sums, _ = residual_sums(strip, state, fit, core)
         middle = sums.shape[1] // 2
         residual_sum, known = sums[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
         step = residual_sum / np.maximum(known, 1e-3 * float(known.max()) + 1e-12)
@@ -251,7 +240,7 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
         return np.nan, np.nan
     bare, tried = replace(state, shading=np.zeros_like(state.shading)), EXPOSURES.tolist()
     tried += [stated_frames] if np.isfinite(stated_frames) else []
-    misfits = np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, fast) for tau in tried])
+    misfits = np.array([residual_sums(strip, replace(bare, lengths=speed * tau), fit, fast)[2] for tau in tried])
     # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
     agrees = len(tried) > len(EXPOSURES) and misfits[-1] <= 1.01 * misfits.min()
     seen = np.nan if agrees else _least_misfit(EXPOSURES, misfits[: len(EXPOSURES)])

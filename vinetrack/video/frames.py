@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import multiprocessing
 import os
 import threading
 from collections.abc import Container, Generator, Iterable, Iterator, Sequence
@@ -65,8 +66,10 @@ def film_shots(
             stream = container.streams.video[0]
             marks = stream.codec_context.name not in NON_MARKING_DECODERS
             faulty: set[int | None] = set()
-            # With one thread each message belongs to the packet that is decoded.
-            stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS if marks else 1
+            # With one thread each message belongs to the packet that is decoded; and one costs less where workers share
+            # the cores.
+            threads = DECODER_THREADS if marks and multiprocessing.parent_process() is None else 1
+            stream.thread_type, stream.codec_context.thread_count = "AUTO", threads
             if span is not None:
                 container.seek(max(span[0], 0), stream=stream)
             for packet in container.demux(stream):

@@ -31,7 +31,7 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
                     stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
                     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
                     # Without mbtree=0 the same pictures are encoded to different bytes (measured).
-                    options = {"preset": "veryfast", "crf": "26", "profile": "high", "tune": "animation"}
+                    options = {"preset": "superfast", "crf": "26", "profile": "high", "tune": "animation"}
                     stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
                     context.thread_count = 1
                     context.colorspace = context.color_primaries = context.color_trc = 6  # BT.601, as OpenCV converts
