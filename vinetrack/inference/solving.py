@@ -156,8 +156,9 @@ def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, since their
-    misfit would be absorbed as noise and stall the optimiser. Shapes: theta (n_free,).
+    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, and with
+    trials that are alike: noise and differences between trials would take up what the model can explain. Shapes: theta
+    (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
@@ -169,7 +170,7 @@ def solve_onward(
         aligned, _ = align(predictor.data, predictor, theta, state.trial_effects)
         here, there = (trial_costs(predictor, problem, each) for each in (state, replace(state, trial_effects=aligned)))
         state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
-        noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
+        noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
         # 40: steps at fixed noise, at most (chosen)
         state = solve(predictor, problem, state, noise, most_iterations=40).state
     return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
