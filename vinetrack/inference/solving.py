@@ -172,7 +172,7 @@ def solve_onward(
         state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
         noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
         # 40: steps at fixed noise, at most (chosen)
-        state = solve(predictor, problem, state, noise, most_iterations=40).state
+        state = replace(solve(predictor, problem, state, noise, most_iterations=40).state, spread=state.spread)
     return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
 
 

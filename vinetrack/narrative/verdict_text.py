@@ -298,10 +298,9 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.odd_trials:
         return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
     if UNEXPLAINED in (verdict, last):
-        told = "`propose` writes a law of the missing force as an effect file of your own"
         if diagnosis.not_tried:
-            return f"fill in what {listed_names(diagnosis.not_tried)} need in the sheet: they were not tried", told
-        table = diagnosis.ladder
+            return f"fill in what {listed_names(diagnosis.not_tried)} need in the sheet: they were not tried", ""
+        table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
         if table is not None and "partial" in table and (near := list(table["added"][table["partial"].astype(bool)])):
             return f"see what `vinetrack add {near[0]} RESULTS`, a part, leaves; then run `vinetrack propose`", told
         return "look at the figures of the missing force, and run `vinetrack propose`", told
