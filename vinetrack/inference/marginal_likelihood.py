@@ -525,8 +525,8 @@ def estimate_between_trial_sd(
     while reach > 2e-3:
         there, value = best_of(best * np.exp(reach * ways))
         best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-5 else (best, lowest, 0.5 * reach)
-    # 0.01: decrease of −2 ln L from which other standard deviations count as likelier (derived)
-    return (float(best[0]), float(best[1])) if lowest < at_current - 0.01 else state.spread
+    # 0.001: decrease of −2 ln L from which other standard deviations count as likelier (derived)
+    return (float(best[0]), float(best[1])) if lowest < at_current - 0.001 else state.spread
 
 
 def log_likelihood(
