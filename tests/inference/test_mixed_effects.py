@@ -183,6 +183,15 @@ def test_noise_is_estimated_without_the_bias_of_fitted_parameters():
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
 
 
+def test_a_noise_correlation_near_the_largest_is_found_between_grid_points():
+    draw, n_trials, count, rho = np.random.default_rng(9), 100, 200, 0.963
+    root = np.linalg.cholesky(covariance(count, rho, 1.0))
+    columns = [np.column_stack([np.zeros((count, 4)), root @ draw.standard_normal(count)]) for _ in range(n_trials)]
+    frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
+    # 20 000 points: ρ to 0.002
+    assert marginal.estimate_noise(crossed(columns), frame, state)[0] == pytest.approx(rho, abs=0.006)
+
+
 @pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
 def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(louder, lowest, highest):
     """Of twelve points σ² scatters by 41 % of itself; what half of the trials have 25 times over is no chance."""

@@ -18,17 +18,19 @@ from vinetrack.diagnosis.locate import Failure
 from vinetrack.diagnosis.result import (
     PROBABILITIES,
     VERDICTS,
+    Candidate,
     Diagnosis,
     EffectPower,
     FurtherTrials,
     NumberWidth,
     Power,
     PowerInput,
+    Round,
 )
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import templates
 from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines
-from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_sentence
+from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_sentence, verdict_table
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -122,3 +124,22 @@ def test_nothing_is_said_of_the_scatter_of_replicates_where_there_are_none(z, co
     row = {"pressure_Pa": 2e4, "payload_kg": 0.0, "vine": "a", "z": z, "rms_m": 1e-3}
     failure = Failure("kPa", pd.DataFrame([row]), pd.DataFrame(), SimpleNamespace(remarks=()))
     assert [one.code for one in failure.remarks()] == ["fails_nowhere"] * count
+
+
+def test_sizes_are_those_fitted_together_with_the_fault_that_remains():
+    alone, together = (
+        Number("reservoir_depletion.gamma", "", "γ", "1", v, 0.01, v - 0.02, v + 0.02) for v in (1.8, 1.4)
+    )
+    fault = Candidate("film_mass", kind="measurement", in_answer_set=True, along=(together,))
+    found = Diagnosis(
+        rounds=(Round(verdict="missing", answer_set=("reservoir_depletion",)),
+                Round(verdict="artefact", answer_set=("film_mass",), ranking=(fault,))),
+        effects=("reservoir_depletion",),
+        stored_parameters=(alone,),
+    )  # fmt: skip
+    assert "γ = 1.400" in {row.question: row.answer for row in verdict_table(found)}["How large"]
+
+
+def test_what_a_blank_column_kept_from_being_tried_comes_first():
+    unexplained = Diagnosis(rounds=(Round(verdict="unexplained"),), not_tried=("inlet_loss",))
+    assert "inlet loss" in verdict_table(unexplained)[-1].answer.replace("_", " ")
