@@ -30,7 +30,7 @@ HEADERS = {
     "steady_to_s,steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency,"
     "tube_width_mm,growth_mm",
     "tracks/d12_0.csv": "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag,tracked_edge_px,"
-    "lead_position_systematic_m",
+    "lead_position_systematic_m,pressure_Pa",
     "kinematics/d12_0.csv": "time_s,lead_position_m,lead_velocity_m_s,lead_velocity_sigma_m_s,tail_velocity_m_s,"
     "lead_acceleration_m_s2",
 }

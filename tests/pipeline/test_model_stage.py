@@ -22,7 +22,7 @@ from vinetrack.pipeline import planning_stage
 from vinetrack.pipeline.model_stage import fit_model
 from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 from vinetrack.pipeline.stages import STAGES, Job
-from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result, read_stored_track
+from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result
 
 TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m\n"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -87,9 +87,9 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path):
     brought = {"time_s": time_s, "position_m": time_s / 10, "pressure_kPa": 20 - 100 * time_s}
     pd.DataFrame(brought).to_csv(tmp_path / "a.csv", index=False)
     (tmp_path / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
-    table = pd.DataFrame({"frame": range(20), "time_s": time_s, "edge_px": np.nan, "lead_position_m": time_s / 10})
-    table = table.assign(lead_position_sigma_m=np.nan, flag="", lead_position_systematic_m=np.nan)
-    track = read_stored_track(read_experiment(tmp_path).trial("a"), table)
+    succeed("trials", tmp_path, tmp_path / "results")
+    ((_, track),), _ = measured_trials(read_experiment(tmp_path), Results(tmp_path / "results"))
+    assert track.lead_position_systematic_m is None
     assert track.pressure_Pa is not None
     np.testing.assert_allclose(track.pressure_Pa, 1e3 * brought["pressure_kPa"])
 

@@ -150,15 +150,13 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     import pandas as pd
 
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
-    track, kinematics = table_of(TRACK_COLUMNS), table_of(KINEMATICS_COLUMNS)
-    if summary is not None:
+    if summary is None:
+        track, kinematics = table_of(TRACK_COLUMNS), table_of(KINEMATICS_COLUMNS)
+    else:
         measured = summary.track
-        unmoved, systematic_m = measured.tracked_px, measured.lead_position_systematic_m
-        columns = vars(measured) | {
-            "frame": np.arange(len(measured.time_s)),
-            "tracked_edge_px": measured.edge_px if unmoved is None else unmoved,
-            "lead_position_systematic_m": np.nan if systematic_m is None else systematic_m,
-        }
+        columns = {name: np.nan if values is None else values for name, values in vars(measured).items()}
+        columns |= {"frame": np.arange(len(measured.time_s))}
+        columns |= {"tracked_edge_px": measured.edge_px if measured.tracked_px is None else measured.tracked_px}
         track = pd.DataFrame({column: columns[column] for column in TRACK_COLUMNS})
         kinematics = pd.DataFrame({column: getattr(summary.kinematics, column) for column in KINEMATICS_COLUMNS})
         point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}

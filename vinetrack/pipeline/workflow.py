@@ -87,14 +87,13 @@ TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings o
 @dataclass(frozen=True)
 class WorkflowPlan:
     """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
-    gets empty ones), `filmed` those that are recordings; `measurements` are files that the virtual laboratory makes,
-    and `state` is that of all files that people brought.
+    gets empty ones); `measurements` are files that the virtual laboratory makes, and `state` is that of all files that
+    people brought.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
-    filmed: tuple[str, ...]
     measurements: tuple[Path, ...]
     state: str
     settings: RunSettings
@@ -122,19 +121,16 @@ class WorkflowPlan:
         return jobs
 
     def files(self, group: str, trials: Sequence[str] | None = None) -> list[str]:
-        """Paths of a file, folder or group of files of the table of stages; of some trials alone, or of all."""
+        """Paths of a file, folder or group of files of the table of stages; of some trials alone, or of all. One file
+        stands for those of a trial: Snakemake takes its time over each.
+        """
         trials = self.trials if trials is None else trials
         if not group.startswith("<"):
             return [self.result(group)]
         if group.startswith("<made of"):
             return [path for part in STAGES[group[9:-1]].writes for path in self.files(part)]
         if group == "<trials>":
-            paths, formats = list[str](), self.settings.figures.formats
-            for trial in trials:
-                paths += [f"tracks/{trial}.csv", f"kinematics/{trial}.csv", f"analysed/{trial}.json"]
-                pictures = ("trial", "strip") if trial in self.filmed else ("trial",)
-                paths += [f"figures/{kind}_{trial}.{form}" for kind in pictures for form in formats]
-            return [self.result(path) for path in paths]
+            return [self.result(f"analysed/{trial}.json") for trial in trials]
         return [path.as_posix() for path in self.measurements]
 
     def result(self, *parts: str) -> str:
@@ -185,7 +181,6 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         experiment=folder,
         results=results,
         trials=tuple(name for name in experiment.names if name not in experiment.left_out),
-        filmed=tuple(trial.name for trial in experiment.trials if trial.video is not None),
         measurements=tuple(path for path in inputs if path not in brought),
         state=hashlib.sha256(repr(state).encode()).hexdigest(),
         settings=settings,

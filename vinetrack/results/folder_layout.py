@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 TRACK_COLUMNS = (
     "frame", "time_s", "edge_px", "lead_position_m", "lead_position_sigma_m", "flag", "tracked_edge_px",
-    "lead_position_systematic_m",
+    "lead_position_systematic_m", "pressure_Pa",
 )  # fmt: skip
 KINEMATICS_COLUMNS = (
     "time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "tail_velocity_m_s",
@@ -224,7 +224,7 @@ def measured_trials(
     for trial in experiment.trials:
         table = read_result(results.track(trial.name))
         if len(table) and trial.name not in failed:
-            pairs.append((trial, read_stored_track(trial, table)))
+            pairs.append((trial, read_stored_track(table)))
             motion = read_result(results.kinematics(trial.name))
             columns: dict[str, Any] = {
                 name: motion[name].to_numpy(dtype=float) for name in KINEMATICS_COLUMNS if name != "tail_velocity_m_s"
@@ -235,21 +235,11 @@ def measured_trials(
     return pairs, kinematics
 
 
-def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
-    """Make a track of `tracks/<trial>.csv`, with the pressure measured in the user's track or trace."""
-    from vinetrack.tracks.importers import load_track, with_pressure_trace
-
-    names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px", "lead_position_systematic_m")
+def read_stored_track(table: pd.DataFrame) -> Track:
+    """Make a track of `tracks/<trial>.csv`; what is NaN in every frame is not known."""
+    names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px")
     columns: dict[str, Any] = {name: table[name].to_numpy(dtype=float) for name in names}
-    track = Track(**columns, flag=table["flag"].to_numpy(dtype=str))
-    if not np.isfinite(columns["lead_position_systematic_m"]).any():
-        track = replace(track, lead_position_systematic_m=None)
-    try:
-        if trial.pressure_trace is not None:
-            return with_pressure_trace(trial, track)
-        source_track = load_track(trial) if trial.track is not None else None
-    except InputError as error:
-        raise ResultsError(f"trial {trial.name}: {error}; then run `vinetrack run` again") from None
-    if source_track is None or source_track.pressure_Pa is None:
-        return track
-    return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))
+    for name in ("lead_position_systematic_m", "pressure_Pa"):
+        values = table[name].to_numpy(dtype=float)
+        columns[name] = values if np.isfinite(values).any() else None
+    return Track(**columns, flag=table["flag"].to_numpy(dtype=str))
