@@ -93,7 +93,7 @@ STAGES = {
         "Draw the figures of the experiment and clips of its recordings, and write the report, a single file.",
         "report_stage:write_report",
         (),
-        ("<trials>", "<made of model>"),
+        ("diagnosis.json",),
         ("report.html", "provenance.json"),  # which figures have content is not known in advance
         "report written",
         parallel=True,

@@ -81,7 +81,7 @@ def path_problems(*folders: Path) -> list[Problem]:
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
-TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
+TRIALS_PER_JOB = 100  # Largest number of trials of one job (chosen: as recordings two cores take one or two minutes)
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,6 @@ class WorkflowPlan:
         trials = self.trials if trials is None else trials
         if not group.startswith("<"):
             return [self.result(group)]
-        if group.startswith("<made of"):
-            return [path for part in STAGES[group[9:-1]].writes for path in self.files(part)]
         if group == "<trials>":
             return [self.result(f"analysed/{trial}.json") for trial in trials]
         return [path.as_posix() for path in self.measurements]
