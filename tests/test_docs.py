@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import typer.main
 from commanded import Shown, pieces, printed, run, succeed
+from hand_sheet import one_vine
 from own_effect import PAGE as OWN_EFFECT
 from own_effect import block, write_effect
 from PIL import Image
@@ -115,12 +116,8 @@ def test_the_python_on_the_page_runs():
 # docs/own_effect.md: its effect and settings work as they stand there.
 def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_provenance(tmp_path):
     experiment, results = tmp_path / "mine", tmp_path / "results"
-    experiment.mkdir()
-    write_effect(experiment)
+    write_effect(one_vine(experiment))
     (experiment / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
-    columns = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"
-    (experiment / "trials.csv").write_text(f"{columns}\na,a.csv,12,100,300,20,3\n", encoding="utf-8")
-    (experiment / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
     shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
     assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
     said = run("effects", "spring_line", "--experiment", experiment).stdout

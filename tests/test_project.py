@@ -1,9 +1,6 @@
-"""The make targets, the lock, the file for hosted machines and Snakemake's profiles name what is here."""
+"""The lock, the file for hosted machines and Snakemake's profiles name what is here."""
 
-import os
 import re
-import shutil
-import subprocess
 import tomllib
 from pathlib import Path
 
@@ -15,20 +12,6 @@ from vinetrack.pipeline.stages import STAGES
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-MAKE = shutil.which("make")
-
-
-@pytest.mark.skipif(MAKE is None, reason="needs make")
-def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path):
-    for name in ("Makefile", "requirements.lock", "pyproject.toml"):
-        shutil.copy(ROOT / name, tmp_path)
-    (tmp_path / ".venv").mkdir()
-    (tmp_path / ".venv" / "installed").touch()
-    asked = [str(MAKE), "--question", "venv"]
-    assert subprocess.run(asked, cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, check=False).returncode == 0
-    later = (tmp_path / ".venv" / "installed").stat().st_mtime + 10
-    os.utime(tmp_path / "requirements.lock", (later, later))
-    assert subprocess.run(asked, cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, check=False).returncode == 1
 
 
 def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_no_path():
@@ -43,12 +26,6 @@ def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_
     assert len(entries) == len(locked(lock)) > 80
     assert all("--hash=sha256:" in entry for entry in entries)
     assert not re.search(r"https?://|file:|^--|^-[a-z]|/", lock + docs, flags=re.MULTILINE)
-
-
-def test_continuous_integration_is_a_sound_script():
-    script = ROOT / ".ci" / "run"
-    assert script.stat().st_mode & 0o111
-    subprocess.run(["bash", "-n", str(script)], check=True)
 
 
 def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there():

@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -17,6 +16,7 @@ from commanded import run, succeed
 from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results
 from grown import FORCES, effect_file, grown
 from grown import sheet as sheet_command
+from hand_sheet import one_vine
 from hidden_truth import sheet
 from lsoda_vine import N_TRUE, small_campaign
 from own_effect import write_effect
@@ -36,16 +36,6 @@ from vinetrack.pipeline.planning_stage import read_basis, read_si_range
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
-SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
-TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20))
-
-
-def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n") -> Path:
-    folder.mkdir()
-    (folder / "trials.csv").write_text(SHEET + rows)
-    (folder / "a.csv").write_text(TRACK)
-    return folder
-
 
 def test_a_page_ends_without_waiting_for_its_thread():
     program = (
@@ -58,16 +48,16 @@ def test_a_page_ends_without_waiting_for_its_thread():
 
 
 def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_share_once(tmp_path):
-    assert run("check", experiment(tmp_path / "sound")).exit_code == 0
+    assert run("check", one_vine(tmp_path / "sound")).exit_code == 0
     rows = "".join(f"t{i},a.csv,12,100,300,9999,3\n" for i in range(200))
-    done = run("check", experiment(tmp_path / "v", rows))
+    done = run("check", one_vine(tmp_path / "v", rows))
     assert done.exit_code == 1
     assert all(word in done.output for word in ("trials.csv", "t0 and 199 more", "pressure_kPa", "9999"))
     assert len(done.output.splitlines()) == 2
 
 
 def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
-    folder = experiment(tmp_path / "v")
+    folder = one_vine(tmp_path / "v")
     without_input, no_json, out_of_bounds = "{}", "seed=3", '{"damping": {"resamples": 3}}'
     for settings, status in ((without_input, 1), (no_json, 2), (out_of_bounds, 1)):
         done = run("model", folder, tmp_path, "--settings", settings)
@@ -78,7 +68,7 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
 
 
 def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
-    folder, log = experiment(tmp_path / "v"), tmp_path / "logs" / "a.log"
+    folder, log = one_vine(tmp_path / "v"), tmp_path / "logs" / "a.log"
     monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
     succeed("trials", folder, tmp_path / "r", "--log", log)
     assert "ZeroDivisionError: unforeseen" in log.read_text()

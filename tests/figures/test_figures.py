@@ -74,17 +74,6 @@ def scaling() -> dict:
     return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
 
 
-def test_the_power_law_and_the_straight_line_are_drawn_as_fitted():
-    ax = draw_scaling(scaling()).axes[0]
-    named = {str(line.get_label()).split()[0]: line for line in ax.lines}
-    power, line = named["power"], named["straight"]
-    x, B = power.get_data()
-    assert pytest.approx(np.exp(-3.0) * np.asarray(x) ** 1.8) == B
-    x, B = line.get_data()
-    assert pytest.approx(-3.0 + 0.3 * np.asarray(x)) == B
-    assert "slope 1.80 (1.2 to 2.4)" in power.get_label()
-
-
 def test_the_same_figure_gives_the_same_bytes():
     first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
     assert first == second

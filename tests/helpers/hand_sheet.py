@@ -13,6 +13,14 @@ GOOD = f"{HEADER}\na,a.csv,24,200,280,28,3,35.6\nb,b.csv,24,200,280,14,3,\n"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i * i / 1e6}\n" for i in range(20))
 
 
+def one_vine(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n", more: str = "") -> Path:
+    """Trials of one track of 20 frames, which is too short for anything; `more` are further columns of the sheet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "trials.csv").write_text(f"{HEADER.removesuffix(',payload_g')}{more}\n{rows}")
+    (folder / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
+    return folder
+
+
 def two_vines(tmp_path: Path) -> Path:
     path = tmp_path / "my-vines"
     path.mkdir()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hand_sheet import one_vine
 from test_pipeline import write_campaign
 
 from vinetrack.cli import commands
@@ -24,10 +25,7 @@ SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_press
 
 
 def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\n") -> Path:
-    folder.mkdir(parents=True)
-    (folder / "trials.csv").write_text(SHEET + rows)
-    (folder / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
-    return folder
+    return one_vine(folder, rows, ",use")
 
 
 def filmed(folder: Path) -> None:
