@@ -134,11 +134,16 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
     assert again.stdout.strip().splitlines()[-1] == done.stdout.strip().splitlines()[-1]
     # Run from elsewhere, Snakemake knows nothing of the run before; results of another version are still told.
     shutil.rmtree(results.parents[1] / ".snakemake" / "metadata")
-    for version, is_due in ((None, False), ("another", True)):
-        if version:
-            (results / "logs" / "version").write_text(version)
+    version, track = results / "logs" / "version", results / "tracks" / "d12_0.csv"
+    kept = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in (version, track)}
+    for change, is_due in ((None, False), (track.unlink, True), (lambda: version.write_text("another"), True)):
+        if change is not None:
+            change()
         planned = snakemake(results.parents[1], "-n", "--config", "experiment=my vines (1)")
         assert ("Nothing to be done" not in planned.stdout + planned.stderr) == is_due
+        for path, (content, time_ns) in kept.items():
+            path.write_bytes(content)
+            os.utime(path, ns=(time_ns, time_ns))
 
 
 @through_snakemake

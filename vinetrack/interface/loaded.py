@@ -406,7 +406,8 @@ def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
     if trial not in names:
         raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
     stated = next((row for row in trials if row.name == trial), None)
-    return _with_content(draw_trial(tables.results, stated, trial), name)
+    windows = read_json(tables.results.analysed(trial))["windows"]
+    return _with_content(draw_trial(tables.results, stated, trial, windows), name)
 
 
 # ------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import traceback
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from importlib import import_module
@@ -99,8 +100,9 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
             raise  # a full disk is not a fault of this trial
         reason, fault = f"could not be analysed: {INTERNAL_ERROR}", traceback.format_exc()
     row = _bare_row(name, "failed", reason, trial) if summary is None else dict(summary.row) | columns
-    _write(results, name, summary, row, view)
-    _draw(name, trial, measurement, reason, results, settings.figures, kept)
+    content = _write(results, name, summary, row) | view
+    _draw(name, trial, measurement, reason, content, results, settings.figures, kept)
+    write_json(results.analysed(name), content)  # the last of its files
     return name, reason, fault
 
 
@@ -145,8 +147,8 @@ def _bare_row(name: str, status: str, reason: str, trial: Trial | None = None) -
     return dict.fromkeys(TRIALS_COLUMNS, np.nan) | known
 
 
-def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any], view: dict[str, Any]) -> None:
-    """Write the files of a trial; without results, tables with headers only and its row."""
+def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any]) -> dict[str, Any]:
+    """Write the tables of a trial, without results headers only; return what it adds to those of the experiment."""
     import pandas as pd
 
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
@@ -169,19 +171,20 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
         content |= {"windows": windows, "point": point}
     write_csv(results.track(name), track)
     write_csv(results.kinematics(name), kinematics)
-    write_json(results.analysed(name), content | view)
+    return content
 
 
 def _draw(
-    name: str, trial: Trial | None, measurement: Measurement | None, reason: str, results: Results,
-    settings: FigureSettings, kept: Kept,
+    name: str, trial: Trial | None, measurement: Measurement | None, reason: str, content: dict[str, Any],
+    results: Results, settings: FigureSettings, kept: Kept,
 ) -> None:  # fmt: skip
     """Draw the motion of a trial, and the strip of a recording with its tracked edge, unless nothing changed."""
     title, ratio = _described(name, trial)
-    shown = [path(name).read_bytes() for path in (results.track, results.kinematics, results.analysed)]
+    shown = [results.track(name).read_bytes(), results.kinematics(name).read_bytes(), content]
 
     def motion() -> Figure:
-        return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
+        drawn = draw_trial(results, trial, name, content["windows"])
+        return drawn or blank(f"{title}: no positions to draw.")
 
     def strip() -> Figure:
         if measurement is None:
@@ -200,12 +203,11 @@ def _described(name: str, trial: Trial | None) -> tuple[str, float]:
     return (name, 2.0) if trial is None else (" · ".join([name, *features(trial)]), trial.travel_ratio)
 
 
-def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
+def draw_trial(results: Results, trial: Trial | None, name: str, windows: Sequence[dict[str, Any]]) -> Figure | None:
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
     title, ratio = _described(name, trial)
-    windows = table_of(STEADY_COLUMNS, read_json(results.analysed(name))["windows"])
     tables = read_result(results.track(name)), read_result(results.kinematics(name))
-    return draw_trial_motion(title, *tables, windows, ratio)
+    return draw_trial_motion(title, *tables, table_of(STEADY_COLUMNS, windows), ratio)
 
 
 # ------------------------------------------------------------------------------

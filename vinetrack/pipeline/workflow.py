@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,14 +100,19 @@ class WorkflowPlan:
     settings: RunSettings
     ground_truth: Path | None
 
-    @property
+    @cached_property
     def version_file(self) -> str:
-        """A file of the results that changes with the package and with any input, which reruns everything; what a stage
-        need not make again is kept. Snakemake need not watch inputs itself, whose names it may take for patterns, and
-        parameters of rules would not do: it compares them only with what it ran from the same folder.
+        """A file of the results that changes with the package, with any input, and where a trial lacks other files than
+        its last, which reruns everything; what a stage need not make again is kept. Snakemake need not watch inputs
+        itself, whose names it may take for patterns, and parameters of rules would not do: it compares them only with
+        what it ran from the same folder.
         """
         path, version = self.results / "logs" / "version", f"{code_hash()} {self.state}"
-        if not path.exists() or path.read_text(encoding="utf-8") != version:
+        figures = (f"figures/trial_{{}}.{form}" for form in self.settings.figures.formats)
+        beside = [self.result(name) for name in ("tracks/{}.csv", "kinematics/{}.csv", *figures)]
+        whole = [trial for trial in self.trials if Path(*self.files("<trials>", [trial])).exists()]
+        torn = not all(Path(name.format(trial)).exists() for trial in whole for name in beside)
+        if torn or not path.exists() or path.read_text(encoding="utf-8") != version:
             write_text(path, version)
         return path.as_posix()
 
@@ -122,7 +128,7 @@ class WorkflowPlan:
 
     def files(self, group: str, trials: Sequence[str] | None = None) -> list[str]:
         """Paths of a file, folder or group of files of the table of stages; of some trials alone, or of all. One file
-        stands for those of a trial: Snakemake takes its time over each.
+        stands for those of a trial, the last that is written: Snakemake takes its time over each.
         """
         trials = self.trials if trials is None else trials
         if not group.startswith("<"):
