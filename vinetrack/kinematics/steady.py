@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,36 +43,27 @@ class WindowMoments:
         """Fit a parabola to the positions in many windows of one length at once. Returns mean lead speed, m/s; relative
         change of speed from end to end; standard error of that. Shapes: first, last (n_windows,) → (n_windows,).
         """
-        s = self.sums[:, last + 1] - self.sums[:, first]
+        sums = self.sums[:, last + 1] - self.sums[:, first]
         half, middle = (self.u[last] - self.u[first]) / 2, (self.u[first] + self.u[last]) / 2
-        # Moments about the middle of each window: Σ(u − m)ᵏ by repeated shifts, then in units of its half-width.
-        shifted = []
-        for row in (s[:5], s[5:]):
-            terms = list(row)
+        # Moments about the middle of each window, Σ(u − m)ᵏ by repeated shifts, in units of its half-width
+        for terms in (sums[:5], sums[5:]):
             for order in range(1, len(terms)):
                 for k in range(len(terms) - 1, order - 1, -1):
-                    terms[k] = terms[k] - middle * terms[k - 1]
-            shifted.append(terms)
-        (count, s1, s2, s3, s4), (y0, y1, y2) = shifted
-        s1, s2, s3, s4 = s1 / half, s2 / half**2, s3 / half**3, s4 / half**4
-        y1, y2 = y1 / half, y2 / half**2
+                    terms[k] -= middle * terms[k - 1]
+            terms /= [half**k for k in range(len(terms))]
+        n, s1, s2, s3, s4, y0, y1, y2 = sums
         # Normal equations of 1, w, w² with the constant eliminated.
-        a11, a12, a22 = s2 - s1 * s1 / count, s3 - s1 * s2 / count, s4 - s2 * s2 / count
-        b1, b2 = y1 - s1 * y0 / count, y2 - s2 * y0 / count
+        a11, a12, a22 = s2 - s1 * s1 / n, s3 - s1 * s2 / n, s4 - s2 * s2 / n
+        b1, b2 = y1 - s1 * y0 / n, y2 - s2 * y0 / n
         determinant = a11 * a22 - a12**2
-        slope = (a22 * b1 - a12 * b2) / determinant
-        curve = (a11 * b2 - a12 * b1) / determinant
-        mean = slope / (half * self.unit_s)
+        slope, curve = (a22 * b1 - a12 * b2) / determinant, (a11 * b2 - a12 * b1) / determinant
+        # Error of a curvature under AR(1) noise over that under white noise
+        weights = np.linspace(-1, 1, int(last[0] - first[0]) + 1) ** 2
+        weights -= np.mean(weights)
+        gain = _ar1_sd(weights, self.correlation) / float(np.linalg.norm(weights))
         with np.errstate(divide="ignore", invalid="ignore"):
-            # Speed goes from (slope − 2 curve) to (slope + 2 curve).
-            drift = 4 * curve / slope
-            curve_sigma = self.noise_m * np.sqrt(a11 / determinant)
-            # Error of a curvature under AR(1) noise over that under white noise
-            weights = np.linspace(-1, 1, int(last[0] - first[0]) + 1) ** 2
-            weights -= np.mean(weights)
-            gain = _ar1_sd(weights, self.correlation) / float(np.linalg.norm(weights))
-            sigma = 4 * curve_sigma * gain / np.abs(slope)
-        return mean, drift, sigma
+            sigma = 4 * self.noise_m * gain * np.sqrt(a11 / determinant) / np.abs(slope)
+            return slope / (half * self.unit_s), 4 * curve / slope, sigma
 
 
 def _ar1_sd(weights: Floats, rho: float) -> float:
@@ -80,32 +71,18 @@ def _ar1_sd(weights: Floats, rho: float) -> float:
     return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
 
 
-@dataclass(frozen=True)
-class LineFit:
-    """Legendre polynomials fitted to the raw positions of one window: speed, its change, and the cubic term. Lead
-    speeds, m/s. `drift` is the relative change of speed across the window; `bend_m_s` is the mean speed of the cubic
-    minus that of the straight line, `bend_sigma_m_s` its standard error.
+def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
+    """Measure speed, drift and variation in a window of at least three points by least squares on the raw positions,
+    with errors for AR(1) noise; the rule decides about acceptance. Where the points scatter about their cubic
+    significantly more than the track's noise, the errors are those of the scatter. The error of x_ss includes the
+    difference of the mean speeds of a cubic and of the line. Shapes: time_s, position_m (n,).
     """
-
-    speed_m_s: float
-    speed_sigma_m_s: float
-    drift: float
-    drift_sigma: float
-    bend_m_s: float
-    bend_sigma_m_s: float
-
-
-def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -> LineFit:
-    """Fit the raw positions of one window of at least three points by least squares, with errors for AR(1) noise. Where
-    the points scatter about their cubic significantly more than `noise_m`, the errors are those of the scatter. Shapes:
-    time_s, position_m (n,).
-    """
-    n = time_s.size
-    half = float(time_s[-1] - time_s[0]) / 2
-    u = (time_s - (time_s[0] + time_s[-1]) / 2) / half
+    inside = slice(first, last + 1)
+    t, y, noise_m, rho = time_s[inside], position_m[inside], kinematics.noise_m, kinematics.noise_correlation
+    n, half = t.size, float(t[-1] - t[0]) / 2
+    u, y = (t - (t[0] + t[-1]) / 2) / half, y - y.mean()
     order = min(3, n - 1)
-    y = position_m - position_m.mean()
-    # Row k has the weights of the highest coefficient of a fit of order k: line, parabola, cubic.
+    # Row k has the weights of the highest coefficient of a Legendre fit of order k: line, parabola, cubic.
     rows = [np.linalg.pinv(np.polynomial.legendre.legvander(u, k))[k] for k in range(1, order + 1)]
     residual = y - np.polynomial.legendre.legval(u, np.polynomial.legendre.legfit(u, y, order))
     # The track's noise, or the scatter in this window where it is larger by more than three standard errors
@@ -113,29 +90,11 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
     variance = float(np.sum(residual**2)) / max(n - order - 1, 1)
     if effective >= 2 and variance > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)):
         noise_m = math.sqrt(variance)
-    slope, curve = float(rows[0] @ y), float(rows[1] @ y)
     errors = [noise_m * _ar1_sd(row, rho) for row in rows]
-    bend, bend_sigma = (float(rows[2] @ y), errors[2]) if order == 3 else (0.0, 0.0)
-    is_moving = slope != 0
-    return LineFit(
-        speed_m_s=slope / half,
-        speed_sigma_m_s=errors[0] / half,
-        drift=6 * curve / slope if is_moving else math.nan,  # d(c₂P₂)/du runs from −3c₂ to 3c₂
-        drift_sigma=6 * errors[1] / abs(slope) if is_moving else math.nan,
-        bend_m_s=bend / half,
-        bend_sigma_m_s=bend_sigma / half,
-    )
-
-
-def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
-    """Measure speed, its standard error, drift and variation in a window; the rule decides about acceptance. The
-    standard error of x_ss includes the noise and, where the speed is curved within the window, the difference of the
-    mean speeds of a cubic and of the line. Shapes: time_s, position_m (n,).
-    """
-    inside = slice(first, last + 1)
-    t = time_s[inside]
-    fit = fit_window(t, position_m[inside], kinematics.noise_m, kinematics.noise_correlation)
-    bend = math.sqrt(max(fit.bend_m_s**2 - fit.bend_sigma_m_s**2, 0.0))
+    slope, curve, bend = (float(row @ y) for row in (*rows, 0 * u)[:3])
+    bend = math.sqrt(max(bend**2 - errors[-1] ** 2, 0.0))  # P₃ moves the ends by 2 of its coefficient
+    # d(c₂P₂)/du runs from −3c₂ to 3c₂
+    drift, drift_sigma = (6 * curve / slope, 6 * errors[1] / abs(slope)) if slope != 0 else (math.nan, math.nan)
     velocity = kinematics.lead_velocity_m_s[inside]
     return Window(
         rule=rule,
@@ -143,11 +102,11 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
         reason="",
         from_s=float(t[0]),
         to_s=float(t[-1]),
-        n_points=t.size,
-        x_ss_m_s=kinematics.travel_ratio * fit.speed_m_s,
-        x_ss_sigma_m_s=kinematics.travel_ratio * math.hypot(fit.speed_sigma_m_s, bend),
-        drift=fit.drift,
-        drift_95=(fit.drift - 1.96 * fit.drift_sigma, fit.drift + 1.96 * fit.drift_sigma),
+        n_points=n,
+        x_ss_m_s=kinematics.travel_ratio * slope / half,
+        x_ss_sigma_m_s=kinematics.travel_ratio * math.hypot(errors[0], bend) / half,
+        drift=drift,
+        drift_95=(drift - 1.96 * drift_sigma, drift + 1.96 * drift_sigma),
         cv=float(velocity.std(ddof=1) / abs(velocity.mean())) if velocity.mean() != 0 else math.nan,
     )
 
@@ -368,19 +327,17 @@ def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
     mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     force_N = (pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N
-    inertial_mass_kg = trial.travel_ratio**2 * mass_kg
 
     def largest_inertia(a: int, b: int) -> float:
         """Largest inertia in any part of a window as a fraction of the force, at the end of its 95 % interval."""
         largest = 0.0
         for low, high in itertools.pairwise(np.linspace(a, b + 1, parts + 1).round().astype(int)):
-            t = time_s[low:high]
-            fit = fit_window(t, position_m[low:high], kinematics.noise_m, kinematics.noise_correlation)
-            if not (fit.speed_m_s > 0 and np.all(force_N[low:high] > 0)):
+            part, force = judge(time_s, position_m, kinematics, low, high - 1, ""), force_N[low:high]
+            if not (part.x_ss_m_s > 0 and np.all(force > 0)):
                 return math.inf
-            to_force = float(np.mean(inertial_mass_kg[low:high]) / np.mean(force_N[low:high]))
-            to_force *= fit.speed_m_s / float(t[-1] - t[0])
-            largest = max(largest, to_force * (abs(fit.drift) + 1.96 * fit.drift_sigma))
+            to_force = float(np.mean(trial.travel_ratio * mass_kg[low:high]) / np.mean(force))
+            to_force *= part.x_ss_m_s / (part.to_s - part.from_s)
+            largest = max(largest, to_force * max(-part.drift_95[0], part.drift_95[1]))
         return largest
 
     # 6: sections between whose ends all windows are tried (chosen)

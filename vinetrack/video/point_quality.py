@@ -5,7 +5,6 @@ Works on positions alone, in pixels by frame, from any tracker.
 
 from __future__ import annotations
 
-import bisect
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
+from vinetrack.tracks.position_noise import rest_points
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 
@@ -78,18 +78,10 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
 
 
 def _first_moving_point(y: Floats, tolerance: float) -> int:
-    """Index of the first point from which `y` stays above the resting level; 0 where the track starts in motion."""
-    level = float(y[0])
-    last_at_rest, ordered = 0, [level]
-    for i in range(1, len(y)):
-        bisect.insort(ordered, float(y[i]))
-        if y[i] - level <= tolerance:
-            last_at_rest = i
-            level = (ordered[i // 2] + ordered[(i + 1) // 2]) / 2
-        elif i + 1 >= len(y) or y[i + 1] - level > tolerance:
-            break
-    # Two equal positions may be a slow start; a rest has three.
-    return last_at_rest + 1 if last_at_rest >= 2 else 0
+    """First of two points in a row above the resting level, which has three; 0 where the track starts in motion."""
+    above = y - np.median(y[: max(rest_points(y), 3)]) > tolerance
+    first = int(np.argmax(np.append(above & np.append(above[1:], True), True)))
+    return first if first > 2 else 0
 
 
 def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, end_px: float) -> PointQuality:
