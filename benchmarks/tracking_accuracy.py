@@ -35,8 +35,7 @@ from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.video import track
-from vinetrack.video.axis import Axis, find_axis
-from vinetrack.video.curved_axis import axis_through
+from vinetrack.video.axis import Axis, axis_through, find_axis
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.track import Tracking, track_frames
 

@@ -12,7 +12,7 @@ from served import Served, Visitor, served_here
 
 from vinetrack.core.tables import read_table, read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.video.curved_axis import axis_from_entry
+from vinetrack.video.axis import axis_from_entry
 
 pytestmark = [
     pytest.mark.slow,

@@ -18,7 +18,7 @@ from vinetrack.core.tables import parse_yaml, read_table
 from vinetrack.pages import draft_files as draft
 from vinetrack.pages.local_page import PageServer
 from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, ruler_in, write_templates
-from vinetrack.video.curved_axis import axis_through
+from vinetrack.video.axis import axis_through
 
 
 def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of_their_numbers(tmp_path):

@@ -10,9 +10,8 @@ from pictures import in_memory
 from plain_scene import Plan, plain_scene, write_images
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import Axis, find_growth_axis
 from vinetrack.video.body import hops_between_bodies
-from vinetrack.video.curved_axis import find_growth_axis
 from vinetrack.video.edge import initial_front_path
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Strip, cut_strip

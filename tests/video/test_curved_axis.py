@@ -10,10 +10,9 @@ from pictures import in_memory, tracked
 from plain_scene import Plan, plain_scene
 
 from vinetrack.core.records import Trial
-from vinetrack.video import curved_axis as curves
-from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video import axis as curves
+from vinetrack.video.axis import Axis, axis_problem, axis_through, find_axis
 from vinetrack.video.calibration import PlaneCalibration, PlaneMap
-from vinetrack.video.curved_axis import axis_problem, axis_through
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import cut_strip

@@ -30,8 +30,7 @@ from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import TEMPLATES, jpeg
 from vinetrack.report.clips import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.video.axis import Axis
-from vinetrack.video.curved_axis import axis_from_entry
+from vinetrack.video.axis import Axis, axis_from_entry
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
 # ------------------------------------------------------------------------------

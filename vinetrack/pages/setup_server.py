@@ -38,9 +38,8 @@ from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.report.build import TOKENS
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import Axis, axis_entry, axis_through
 from vinetrack.video.calibration import find_board
-from vinetrack.video.curved_axis import axis_entry, axis_through
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_problems, tracked_facts
 from vinetrack.video.track import Tracking

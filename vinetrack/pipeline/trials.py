@@ -44,8 +44,7 @@ from vinetrack.results.folder_layout import (
     table_of,
 )
 from vinetrack.tracks.importers import load_track, with_pressure_trace
-from vinetrack.video.axis import askew_trials, slope_deg
-from vinetrack.video.curved_axis import axis_entry
+from vinetrack.video.axis import askew_trials, axis_entry, slope_deg
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
 

@@ -19,8 +19,7 @@ from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, co
 from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
-from vinetrack.video.axis import Axis
-from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.axis import Axis, axis_entry, axis_from_entry
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.survey import Measurement
 from vinetrack.video.write import write_clip

@@ -28,9 +28,8 @@ from vinetrack.core.units import number
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, axis_through
+from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through, find_growth_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.curved_axis import axis_entry, axis_problem, find_growth_axis
 from vinetrack.video.edge import tube_strip
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate

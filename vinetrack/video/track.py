@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.video.axis import Axis, centred_on_motion, find_axis
+from vinetrack.video.axis import Axis, axis_problem, centred_on_motion, find_axis, find_growth_axis
 from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.curved_axis import axis_problem, find_growth_axis
 from vinetrack.video.edge import EdgeTracker
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
