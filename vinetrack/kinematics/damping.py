@@ -355,7 +355,6 @@ def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> l
     """Groups of vines of several sizes that are alike in another, with the dependence of B on the size."""
     (other,) = within
     ordered = table.dropna(subset=[along, other]).sort_values(other, kind="stable")
-    groups = [group.sort_values(along, kind="stable") for group in alike(ordered, within)]
     return [
         {
             "along": along,
@@ -365,8 +364,7 @@ def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> l
             "B_95": group["B_95"].tolist(),
             **_lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group)),
         }
-        for group in groups
-        if np.unique(group[along].round(6)).size > 1
+        for group in _of_several_sizes(ordered, within, [along])
     ]
 
 

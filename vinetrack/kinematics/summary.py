@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Kinematics, Track, Trial
+from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left_out
 from vinetrack.kinematics.force import (
-    Release,
     SteadyForce,
     TrialMotion,
     Window,
@@ -171,15 +170,11 @@ class TrialError(ValueError):
 
 
 @dataclass(frozen=True)
-class TrialResult:
-    """Results of one trial: its corrected track, motion, windows by rule, and its rows of results. `row` has the
-    columns of `trials.csv`, `point` those of the damping fit, with `used` and the `reason` if not.
+class TrialResult(TrialMotion):
+    """Results of one trial under a model. `row` has the columns of `trials.csv`, `point` those of the damping fit, with
+    `used` and the `reason` if not.
     """
 
-    track: Track
-    kinematics: Kinematics
-    release: Release
-    windows: Mapping[str, Window]
     row: Mapping[str, object]
     point: Mapping[str, object]
 
@@ -271,7 +266,7 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "tube_width_mm": math.nan,
         "growth_mm": 1e3 * float(moved_m.max() - motion.release.lead_position_m) if moved_m.size else math.nan,
     }
-    return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
+    return TrialResult(**vars(motion) | {"windows": windows, "row": row, "point": damping_point(trial, steady)})
 
 
 def _chosen(windows: Mapping[str, Window]) -> Window | None:

@@ -420,29 +420,23 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
     if first < fewest_rest_frames:
         return none
     rest_px = float(np.median(edge[:first]))
-    exited = np.flatnonzero((edge > rest_px + START_CLEARANCE_PX) & (np.arange(len(edge)) >= first))
     near = np.arange(round(rest_px) - search_px, round(rest_px) + search_px + 1)
     # Not where the tip comes to rest: it is round.
-    later = np.arange(
-        near[-1] + film_range_px[0], min(near[-1] + film_range_px[1], int(edge.max() - START_CLEARANCE_PX))
-    )
-    if len(exited) < fewest_rest_frames or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < film_range_px[0]:
-        return none
+    last_px = int(edge.max() - START_CLEARANCE_PX)
+    later = np.arange(near[-1] + film_range_px[0], min(near[-1] + film_range_px[1], last_px))
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
-    # Median over up to 15 frames of the middle rows, free of flicker; the moving tail averages out.
+    if near[0] < beside or len(later) < film_range_px[0]:
+        return none
     # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
-    rows = strip.values.shape[1]
-    edge_rows, chosen = round((1 - 0.6) / 2 * rows), exited[np.unique(np.linspace(0, len(exited) - 1, 15).astype(int))]
-    columns = slice(near[0] - beside, later[-1] + beside)
-    film_picture = np.median(strip.brightness(chosen, columns)[:, edge_rows : rows - edge_rows], axis=0)
-    near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
+    edge_rows = round((1 - 0.6) / 2 * strip.values.shape[1])
+    film = state.appearance[0, edge_rows : strip.values.shape[1] - edge_rows]
     # Step of brightness across each column, by row; the first column is `beside`.
-    sides = np.lib.stride_tricks.sliding_window_view(film_picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
+    sides = np.lib.stride_tricks.sliding_window_view(film, BORDER_SIDE_PX, axis=1).mean(axis=2)
     borders = sides[:, beside + BORDER_GAP_PX :] - sides[:, : -beside - BORDER_GAP_PX]
     border_steps = borders[:, near - beside].T
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
-    film_step = float(np.abs(np.median(borders[:, film_columns - beside], axis=0)).max())
+    film_step = float(np.abs(np.median(borders[:, later - beside], axis=0)).max())
     contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
     # 2.0, 0.5: least ratio of the border to the largest step of film further on, and to its contrast (measured)

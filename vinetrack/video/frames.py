@@ -205,17 +205,12 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     if len(luma) < 8:
         return odd
     small = luma[:8, ::4, ::4].astype(np.float32)
-
-    def difference(a: int, b: int) -> float:
-        return float(np.mean(np.abs(small[a] - small[b])))
-
-    median_difference = float(np.median([difference(i, i + 1) for i in range(3, 7)]))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
+    typical = float(np.median(np.abs(np.diff(small[3:], axis=0)).mean(axis=(1, 2))))
+    # 3: number of first frames that may be odd, which are compared with the next two (chosen)
     # 8.0, 6.0: A frame is odd where it differs from later ones by this many times what neighbours differ by (chosen)
-    limit = max(8.0 * median_difference, 6.0 * unit)
-    # 3: number of first frames that may be odd (chosen)
-    for i in range(3):
-        odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
+    differ = np.abs(small[:3, None] - small[3:5]).mean(axis=(2, 3))
+    odd[:3] = differ.min(axis=1) > max(8.0 * typical, 6.0 * unit)
     return odd
 
 
