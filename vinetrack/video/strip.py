@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.small_pictures import SmallPictures
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
@@ -121,46 +121,45 @@ def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
     """Move an axis that lies along rows or columns, except for a small slope over its whole length (0.4 px, chosen),
     onto whole rows or columns. Cutting then needs no interpolation, and a tenth of the time.
     """
-    if axis.bends:
+    ends = np.array([axis.from_px, axis.to_px], dtype=float)
+    extent = np.abs(ends[1] - ends[0])
+    level = int(np.argmin(extent))
+    if axis.bends or extent[level] > tolerance_px or extent[1 - level] <= 10:
         return axis
-    (x0, y0), (x1, y1) = axis.from_px, axis.to_px
-    x, y = round((x0 + x1) / 2), round((y0 + y1) / 2)
-    if abs(y1 - y0) <= tolerance_px and abs(x1 - x0) > 10:
-        return Axis((round(x0), y), (round(x1), y), axis.width_px)
-    if abs(x1 - x0) <= tolerance_px and abs(y1 - y0) > 10:
-        return Axis((x, round(y0)), (x, round(y1)), axis.width_px)
-    return axis
+    ends[:, level] = ends[:, level].mean()
+    return axis_through(np.rint(ends), axis.width_px)
 
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:
     """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
-    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel;
-    beyond the picture its border is repeated.
+    along rows or columns of the picture is cut without interpolation, after moving it by less than half a pixel.
     Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
     rows_px (n_rows,); shift_px (n_frames, 2) → (n_frames, n_rows, n_along).
     """
+    along = np.arange(int(np.floor(axis.length_px)) + 1, dtype=float)
+    places = axis.points(along[None, :], rows_px[:, None].astype(float))
+    if shift_px is None and not axis.bends and max(abs(axis.direction)) > 1 - 1e-9:
+        places = np.rint(places).astype(int)
+    return _pixels(luma, places.reshape(-1, 2), shift_px).reshape(len(luma), len(rows_px), len(along))
+
+
+def _pixels(luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | None) -> NDArray[Any]:
+    """Pixels (x, y) of every frame, each moved by its own shift, bicubic; beyond the picture its border is repeated.
+    Whole places without a shift are read as they are. Shapes: places (n_pixels, 2) → (n_frames, n_pixels).
+    """
     import cv2
 
-    n_along = int(np.floor(axis.length_px)) + 1
-    along, across = axis.direction, axis.normal
-    start = axis.points(np.array(0.0), float(rows_px[0]))
-    if shift_px is None and not axis.bends and max(abs(along)) > 1 - 1e-9:
-        level = abs(along[0]) > 0.5
-        steps = (along[0], across[1]) if level else (across[0], along[1])
-        counts = (n_along, len(rows_px)) if level else (len(rows_px), n_along)
-        x, y = (
-            np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
-            for k in (0, 1)
-        )
-        part = luma[:, y][:, :, x]
-        return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
-    out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
+    if shift_px is None and places.dtype.kind == "i":
+        x, y = np.clip(places, 0, np.array(luma.shape[:0:-1]) - 1).T
+        return np.take(luma.reshape(len(luma), -1), y * luma.shape[2] + x, axis=1)
+    # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
+    rows = np.pad(places, ((0, -len(places) % 1000), (0, 0)), mode="edge").reshape(-1, 1000, 2).astype(np.float32)
+    x, y = np.ascontiguousarray(np.moveaxis(rows, 2, 0))
+    out = np.empty((len(luma), *x.shape), luma.dtype)
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
-    places = axis.points(np.arange(n_along, dtype=float)[None, :], rows_px[:, None].astype(float))
-    x, y = np.ascontiguousarray(np.moveaxis(places, 2, 0), dtype=np.float32)
     for frame, cut, (dx, dy) in zip(luma, out, shifts.astype(np.float32), strict=True):
         cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=cut, borderMode=cv2.BORDER_REPLICATE)
-    return out
+    return out.reshape(len(luma), -1)[:, : len(places)]
 
 
 # ------------------------------------------------------------------------------
@@ -259,45 +258,19 @@ def _reference(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> 
     return np.stack([middle, np.ones(len(places)), (left - right) / 2, (above - below) / 2])
 
 
-def _pixels(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> NDArray[Any]:
-    """Pixels (x, y) of every frame, each moved by its own shift, bicubic; shape (n_frames, n_pixels)."""
-    import cv2
-
-    if shift_px is None:
-        return np.take(luma.reshape(len(luma), -1), places[:, 1] * luma.shape[2] + places[:, 0], axis=1)
-    # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
-    rows = np.pad(places, ((0, -len(places) % 1000), (0, 0)), mode="edge").reshape(-1, 1000, 2).astype(np.float32)
-    x, y = rows[..., 0], rows[..., 1]
-    moved = [
-        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        for frame, (dx, dy) in zip(luma, shift_px.astype(np.float32), strict=True)
-    ]
-    return np.stack(moved).reshape(len(luma), -1)[:, : len(places)]
-
-
 def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Floats | None) -> tuple[Floats, Floats]:
-    """Register every frame to the static background by robust least squares. The model is frame(x) = gain · picture(x −
-    shift) + level, linearised in the shift. A ridge keeps the level near zero, and the shift at zero where the
-    background has no texture. Returns gain, level, shift in x and y of every frame, shape (n_frames, 4), and the
-    standard errors of the shift, shape (n_frames, 2). Shapes: luma (n_frames, height, width); places (n_pixels, 2);
-    basis (4, n_pixels); shift_px (n_frames, 2).
+    """Register every frame to the static background by least squares, twice: the second time without outliers (4 sd).
+    The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
+    zero, and the shift at zero where the background has no texture. Returns gain, level, shift in x and y of every
+    frame, shape (n_frames, 4), and the standard errors of the shift, shape (n_frames, 2). Shapes: luma (n_frames,
+    height, width); places (n_pixels, 2); basis (4, n_pixels); shift_px (n_frames, 2).
     """
     level = float(np.abs(basis[0]).mean()) + 1e-9
     ridge = np.diag([0.0, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
-    solution, sigma = _robust_fits(_pixels(luma, places, shift_px), basis, ridge)
-    solution[:, 2:] /= np.maximum(solution[:, :1], 0.05)
-    return solution, sigma
-
-
-def _robust_fits(data: NDArray[Any], basis: Floats, ridge: Floats) -> tuple[Floats, Floats]:
-    """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd). `data`
-    has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
-    standard errors of the last two, shape (n_frames, 2).
-    """
     every = slice(None, None, 4)  # pixels of which medians are taken (derived)
-    solution, error = np.zeros((len(data), 4)), np.full((len(data), 2), np.inf)
+    solution, error = np.zeros((len(luma), 4)), np.full((len(luma), 2), np.inf)
     typical = max(_median(basis[0, every]), 1e-9)
-    for k, values in enumerate(data.astype(float)):
+    for k, values in enumerate(_pixels(luma, places, shift_px).astype(float)):
         inlier, used = np.ones(len(values), dtype=bool), basis
         for turn in range(2):
             inverse = np.linalg.inv(used @ basis.T + ridge)
@@ -312,6 +285,7 @@ def _robust_fits(data: NDArray[Any], basis: Floats, ridge: Floats) -> tuple[Floa
                 if np.count_nonzero(inlier) > 0.99 * inlier.size:
                     break
                 used = basis * inlier
+    solution[:, 2:] /= np.maximum(solution[:, :1], 0.05)
     return solution, error
 
 
