@@ -142,54 +142,39 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))).tolist():
         if rows[i + 1] <= after:
             continue
-        around = frame, y, i, noise_m[i], rho, rows
-        fault = _dropped_frames(*around) or _repeated_frame(*around)
-        if fault is not None:
+        if (fault := _fault_at(frame, y, i, noise_m[i], rho, rows)) is not None:
             return fault
     return None
 
 
-def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
-    """The fault where frames are missing between points i and i + 1, or None."""
+def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
+    """What happened between points i and i + 1: frames are missing, or the second repeats the first, and replaced a
+    frame or was inserted; None where nothing is sure.
+    """
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
-    if jump is None or frame[i + 1] - frame[i] != 1:
-        return None
-    size, sigma, step = jump
-    missing = round(size / step)
-    long_step = y[i + 1] - y[i]
-    if missing < 1 or long_step <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
-        return None
-    # Both single neighbours count too, to within a standard error: in acceleration the one after is nearly as long.
-    nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
-    if long_step <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
-        return None
-    if abs(size - missing * step) > max(4 * sigma, 0.3 * step):
-        return None
-    return _Fault("dropped", int(rows[i + 1]), missing)
-
-
-def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
-    """The fault where point i + 1 repeats point i, whether it replaced a frame or was inserted, or None."""
+    if jump is not None and frame[i + 1] - frame[i] == 1:
+        missing, is_long = round(jump.size / jump.step), y[i + 1] - y[i] > DROP_RATIO * jump.step
+        if missing >= 1 and is_long and jump.size >= JUMP_SIGMAS * jump.sigma:
+            return _Fault("dropped", int(rows[i + 1]), missing)
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
-    if jump is None or frame[i + 1] - frame[i] != 1:
+    if jump is None:
         return None
     size, sigma, step = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
     short_step = y[i + 1] - y[i]
     # A copy stands still to within this part of a step, and the step must be this significant.
-    moves = abs(short_step) > min(0.25 * step, 4 * step_sigma + 0.02 * step)
-    if moves or step - short_step < 5.0 * step_sigma:
+    if abs(short_step) > min(0.25 * step, 4 * step_sigma + 0.02 * step) or step - short_step < 5.0 * step_sigma:
         return None
     if 0 < i < y.size - 3 and 2 * step_sigma < sigma:
         # Where the motion is curved, the two steps minus their two neighbours are the better measure.
         size, sigma = float(y[i + 2] - y[i] - (y[i] - y[i - 1]) - (y[i + 3] - y[i + 2])), 2 * step_sigma
-    if abs(size) <= max(3 * sigma, 0.3 * step) and abs(size) < 0.5 * step:
+    allowed = max(3 * sigma, 0.3 * step)
+    if abs(size) <= allowed:
         return _Fault("stale", int(rows[i + 1]))
-    # The step back after an inserted copy must be significant.
-    if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > 3.5 * sigma:
-        without = np.delete(frame, i + 1), np.delete(y, i + 1)
-        if -_wide_jump(*without, i, noise_m) < LEAST_SHARE * step:
-            return None
+    without = np.delete(frame, i + 1), np.delete(y, i + 1)
+    # The step back after an inserted copy must be significant, and points farther away must not deny it.
+    is_back = abs(size + step) <= allowed and -size > 3.5 * sigma
+    if is_back and not -_wide_jump(*without, i, noise_m) < LEAST_SHARE * step:
         return _Fault("inserted", int(rows[i + 1]))
     return None
 
@@ -207,8 +192,8 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
         near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
         slower, faster = min(near_left, near_right), max(near_left, near_right)
-        # Both sides must move by three quarters of a clear step, and a larger ratio of speeds may be acceleration.
-        if slower < 0.75 * CLEAR_STEP_SIGMAS * noise_m or slower <= 0 or faster > 1.8 * slower:
+        # A larger ratio of speeds may be acceleration.
+        if slower <= 0 or faster > 1.8 * slower:
             continue
         both, t = np.concatenate([y_left, y_right]), np.concatenate([t_left, t_right]) - (t_left[-1] + t_right[0]) / 2
         basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
@@ -219,8 +204,7 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
         if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
             continue
-        lag = np.abs(np.subtract.outer(t, t))
-        correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
+        correlation = rho ** np.abs(np.subtract.outer(t, t))
         sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
         return _Jump(float(fit[3]), sigma, step)
     return None

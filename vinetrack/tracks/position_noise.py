@@ -15,7 +15,7 @@ from itertools import accumulate, product
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, with_flag
+from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -143,17 +143,12 @@ def position_noise(time_s: Floats, position_m: Floats, *, robust: bool = False) 
     """
     if position_m.size < 5:
         return 0.0, 0.0
-    groups = []
     n_rest = _frames_at_rest(position_m)
-    if n_rest:
-        # At rest, straight lines through 32 points.
+    # From 90 moving points on, stretches are twice as long.
+    length = MOVING_STRETCH if position_m.size - n_rest < 90 else 2 * MOVING_STRETCH
+    groups = [_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER)]
+    if n_rest:  # straight lines through 32 points
         groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], 32, 1))
-    n_moving = position_m.size - n_rest
-    # From 60 frames at rest on, their noise alone counts as that of the track.
-    if n_rest < 60 or n_moving > n_rest:
-        # From 90 moving points on, stretches are twice as long.
-        length = MOVING_STRETCH if n_moving < 90 else 2 * MOVING_STRETCH
-        groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
     noise_m, correlation = _restricted_likelihood(groups)
     # Such noise may be motion that a cubic does not follow.
     if correlation > 0.85:
@@ -248,16 +243,10 @@ def rest_points(position_m: Floats) -> int:
         return 0
     noise_m = 2 * rough_noise(position_m) + 1e-12
     future_low = np.minimum.accumulate(position_m[::-1])[::-1]
-    level, left = float(np.median(position_m[:5])), n
-    for _ in range(4):
-        above = np.flatnonzero(future_low > level + 5 * noise_m)
-        left_now = int(above[0]) if above.size else n
-        if left_now == left:
-            break
-        left = left_now
-        level = float(np.median(position_m[: max(left, 3)]))
-    if left == n:
+    above = np.flatnonzero(future_low > float(np.median(position_m[:5])) + 5 * noise_m)
+    if not above.size:
         return n
+    left = int(above[0])
     # Points before the corner of the best flat-then-straight line through those up to there
     y = position_m[: min(n, left + 3)] - position_m[0]
     corners = np.arange(max(y.size - 400, 0), y.size - 1)
@@ -369,7 +358,7 @@ class LocalFit:
     gain: Floats
     spread_m: Floats
     share: Floats
-    near: Indices
+    near: Floats
     speed_m_s: Floats
 
 
@@ -405,7 +394,6 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     # The point itself lies at 0, where the cubic is its first coefficient.
     first_coefficient = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     leverage = weight * np.einsum("wip,wp->wi", powers, _normal_solution(powers, weight, first_coefficient))
-    # Of the 4 nearest neighbours, 3 must lie on the cubic too (`_outlying`).
     nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :4]
     return LocalFit(
         residual_m=-coefficients[:, 0],
@@ -488,8 +476,8 @@ def _outlying(time_s: Floats, position_m: Floats, limit: float) -> Bools:
     from_end = np.where(lags, np.arange(distance_m.size)[::-1], np.arange(distance_m.size))
     # Within this many points of an end the motion may have stopped or begun between two frames.
     allowance_m = np.where(from_end < 2, 1.5 * (from_end + 1) * step_m, 0.0)
-    isolated = (fit.share >= LEAST_SHARE) & (fit.near >= 3)
-    return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated & (sigma_m > 0))
+    isolated = (fit.share >= LEAST_SHARE) & (fit.near >= 3) & (sigma_m > 0)
+    return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated)
 
 
 def _normal_solution(powers: Floats, weight: Floats, right: Floats) -> Floats:
