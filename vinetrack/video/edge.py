@@ -317,34 +317,26 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
     the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
     more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
     """
-    # Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
-    long_rest_frames = 8
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
         return fit
     out = fit.copy()
     bad_misfit = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
     decentrality = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
-    # Rough are points further from the mean of their neighbours than a pixel and 0.15 of the step.
-    at, rough = fit[moving, 0], np.ones(len(moving), dtype=bool)
-    rough[1:-1] = np.abs(at[1:-1] - 0.5 * (at[2:] + at[:-2])) > 1.0 + 0.15 * np.abs(at[2:] - at[:-2]) / 2
-    anchor = int(moving[np.argmin(decentrality + rough + (fit[moving, 2] > bad_misfit))])
+    anchor = int(moving[np.argmin(decentrality + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
     edge = out[:, 0].tolist()
     for sense in (-1, 1):
-        resting = 0
         for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
             previous, second, third = (edge[min(max(t - k * sense, 0), len(edge) - 1)] for k in (1, 2, 3))
             # The larger of two steps, since a frame may repeat the one before it.
             step = max(0.0 if math.isnan(gap) else abs(gap) for gap in (second - previous, third - second))
-            resting = resting + 1 if step < 0.3 else 0
             reach = max(1.3 * step, step + 1.5)
             low, high = (previous - reach, previous + 0.8) if sense < 0 else (previous - 0.8, previous + reach)
             inside, faint = low <= edge[t] <= high, out[t, 3] < LEAST_FITTED_AMPLITUDE - 1
-            good_enough = (out[t, 2] <= bad_misfit or resting > long_rest_frames) and not faint
-            if not math.isfinite(previous) or (inside and good_enough):
+            if not math.isfinite(previous) or (inside and out[t, 2] <= bad_misfit and not faint):
                 continue
-            replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
+            replacement = _best_between(strip, state, t, low, high)
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
             ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
@@ -361,9 +353,9 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
     return out
 
 
-def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
+def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float) -> Floats | None:
     """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
-    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
+    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))
     fits = search_edges(strip, state, np.full(len(places), t), places)
     inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
     inside &= np.isfinite(fits[:, 2])
@@ -401,8 +393,7 @@ UNUSUAL_MISFIT_RATIO = 2.4
 # Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
 # visible (chosen)
 LEAST_AMPLITUDE = 0.6
-# Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
-GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
+NO_EDGE_PX = 2 * ASTRAY_PX  # Standard error stated where there is no edge
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
@@ -458,10 +449,10 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     6); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
-    # 1.6, 0.75: misfit above which, and amplitude below which, part of the edge is hidden (chosen)
+    # 1.6: misfit above which part of the edge is hidden (chosen)
     unusual = _near_start(edge) & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (misfit > 1.6)
     covered = unusual & ((misfit > HIDDEN_MISFIT) | (amplitude < LEAST_AMPLITUDE))
-    guess = np.where(unusual & (amplitude < 0.75), GUESSED_PX, 0.0)
+    guess = np.zeros(len(edge))
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
@@ -557,10 +548,8 @@ class EdgeTracker(Tracker):
         for iteration in range(3 * rounds):
             before = fit[:, 0]
             # Take over the fitted edges, and hold them at rest; blur lengths, film and background follow from them.
-            edge, fitted = (
-                np.where(np.isfinite(before), before, state.edge),
-                np.flatnonzero(informative_frames(state.edge)),
-            )
+            fitted = np.flatnonzero(informative_frames(state.edge))
+            edge = np.where(np.isfinite(before), before, state.edge)
             edge = edge[np.clip(np.arange(len(edge)), fitted[0], fitted[-1])]
             state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
             state = estimate_appearance(strip, state, 4 * strip.noise + 4)
