@@ -347,12 +347,13 @@ def test_the_yield_pressure_is_estimated_instead_of_a_release():
 
 
 def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch):
-    whole, calls = Predictor.linearise, []
+    whole, reached = Predictor.linearise, list[Floats]()
 
     def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
-        calls.append(trial_effects_only)
-        if not trial_effects_only and calls.count(False) > 2:
+        if not trial_effects_only and len(reached) > 2 and not np.array_equal(theta, reached[-1]):
             raise SimulationError("Trial slow0: the model could not be integrated beyond 0.3 s.")
+        if not trial_effects_only:
+            reached.append(theta)
         return whole(self, theta, own, trial_effects_only=trial_effects_only)
 
     monkeypatch.setattr(Predictor, "linearise", breaks_later)
@@ -381,8 +382,9 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
     assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
     for one, other in zip(warm.numbers, cold.numbers, strict=True):
         assert one.name == other.name
-        assert abs(one.value - other.value) < 0.1 * other.sigma
-        assert one.sigma == pytest.approx(other.sigma, rel=0.05)
+        # Two maxima of the scatter of pressure and B lie within 0.2 of −2 ln L of each other.
+        assert abs(one.value - other.value) < 0.2 * other.sigma
+        assert one.sigma == pytest.approx(other.sigma, rel=0.1)
     # The parameters of a vine that is left out are dropped.
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])

@@ -32,8 +32,8 @@ from vinetrack.inference.marginal_likelihood import (
 )
 from vinetrack.inference.sensitivity import Predictor, initial_trial_effects
 from vinetrack.inference.trial_effects import (
-    ReleaseSearch,
-    limited_step,
+    likelier_releases,
+    moved_effects,
     optimise_trial_effects,
     residuals_in,
     trial_costs,
@@ -235,90 +235,63 @@ def solve(
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
-    columns: Sequence[Floats] | None = None,
     least_decrease: float = CONVERGED_DECREASE,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
-    Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
+    Levenberg–Marquardt damping where a full step fails.
     """
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
     state = _with_fixed_terms(state, fixed_terms)
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
-    damping, converged, iteration, predicted_decrease = 0.0, False, 0, math.inf
-    columns, cross_products = (
-        _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
-    )
+    damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
+    columns, cross_products = _linearise(predictor, state)
     # 5, 4: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
     # many of these searches may move one (chosen)
-    searches_left, releases, at_corner = 4, ReleaseSearch(predictor, problem), False
+    searches_left = 4
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
-        # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
-        # 9: steps at most in which a fit counts as far off (chosen)
-        far_off = predicted_decrease > far_decrease and iteration <= 9
+        far_off = predicted_decrease > far_decrease
         state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
         if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
-            break  # They have taken it up.
+            break  # They have taken up what the model lacks.
         variances_moved = variance_change(before, state)
-        damping_before = damping
-        (step, effect_step, predicted_decrease), damping = _next_step(
-            cross_products, problem, state, damping, least_decrease
-        )
-        is_full_instead, predictor.is_central = damping_before > damping, predicted_decrease < far_decrease
+        full = levenberg_marquardt_step(cross_products, problem, state, 0.0)
+        damped = levenberg_marquardt_step(cross_products, problem, state, damping) if damping > 0 else full
+        predicted_decrease = full[2]
+        predictor.is_central = predicted_decrease < far_decrease
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
-        small_step = predicted_decrease < least_decrease or at_corner
-        at_corner = False
+        # At a corner of the cost, where a frame crosses the end of growth, a step promises more than it brings.
+        small_step = min(predicted_decrease, decrease) < least_decrease
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (small_step or iteration % 5 == 0):
-            relocated = releases.likelier(state, residuals_in(columns))
+            relocated = likelier_releases(predictor, problem, state)
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
-                searches_left -= 1
+                searches_left, decrease = searches_left - 1, math.inf
                 continue
             searches_left = 0 if small_step else searches_left
         if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
-            converged = True
+            converged = predicted_decrease < far_decrease
             break
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
         accepted, damping = _accepted_step(
-            predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
+            predictor, problem, cross_products, state, damped[:2], damping, penalised_squares
         )
-        if accepted is None:
-            # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
-            # step should gain much, it is no minimum, but nothing more can be done.
-            if variances_moved < CONVERGED_VARIANCES:
-                converged = predicted_decrease < far_decrease
-                break
-            continue
         try:
-            columns, cross_products = _linearise(predictor, accepted)
+            if accepted is not None:
+                columns, cross_products = _linearise(predictor, accepted)
         except SimulationError:
             # A perturbed trajectory of the new state cannot be simulated: the last state is still a result.
             break
-        state = accepted
-        if is_full_instead and damping > 0:
-            # A damped step looked converged, the full one was refused, and the damped one lowers the cost by little.
-            squares_now = cost(predictor, problem, state, residuals_in(columns))
-            at_corner = penalised_squares - squares_now < least_decrease
+        state = accepted or state
+        decrease = penalised_squares - cost(predictor, problem, state, residuals_in(columns))
     return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
-
-
-def _next_step(
-    cross_products: Floats, problem: MixedProblem, state: FitState, damping: float, least_decrease: float
-) -> tuple[tuple[Floats, Floats, float], float]:
-    """The damped step, or the full one where the damped one looks converged; and the damping of the step returned. A
-    damped step is short wherever the minimum lies, so only the full step tells whether a fit has converged.
-    """
-    damped = levenberg_marquardt_step(cross_products, problem, state, damping)
-    if damping == 0 or damped[2] >= least_decrease:
-        return damped, damping
-    return levenberg_marquardt_step(cross_products, problem, state, 0.0), 0.0
 
 
 def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:
@@ -345,11 +318,13 @@ def update_variances(
     *,
     far_off: bool = False,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
+    """Estimate noise and between-trial standard deviations; of a fit that is far off not the correlation of the noise,
+    which would take up the misfit.
+    """
     if fixed_terms.noise is None:
         rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if any(estimable_sd) and not far_off:
+    if any(estimable_sd):
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
         state = replace(state, spread=spread)
     return state
@@ -369,8 +344,7 @@ def _accepted_step(
     problem: MixedProblem,
     cross_products: Floats,
     state: FitState,
-    step: Floats,
-    effect_step: Floats,
+    steps: tuple[Floats, Floats],
     damping: float,
     penalised_squares: float,
 ) -> tuple[FitState | None, float]:
@@ -382,8 +356,7 @@ def _accepted_step(
     def lowered(step: Floats, effect_step: Floats) -> FitState | None:
         theta = np.clip(state.theta + step, problem.lower, problem.upper)
         try:
-            effects = limited_step(predictor, state.trial_effects, effect_step)
-            reached = replace(state, theta=theta, trial_effects=effects)
+            reached = replace(state, theta=theta, trial_effects=moved_effects(state.trial_effects, effect_step))
             reached, costs = optimise_trial_effects(predictor, problem, reached)
         except SimulationError:
             return None
@@ -392,7 +365,7 @@ def _accepted_step(
     # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
     # increased (chosen)
     for fraction in (1.0, 0.4, 0.15):
-        candidate = lowered(fraction * step, fraction * effect_step)
+        candidate = lowered(*(fraction * step for step in steps))
         if candidate is not None:
             return candidate, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(11):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -408,10 +409,10 @@ def _adapted_steps(response: Floats, previous: Floats) -> Floats:
 
 
 # ------------------------------------------------------------------------------
-# Starting values of a fit: release and origin from the frames at rest, B and n from a coarse grid search.
+# Starting values of a fit: release and origin from the frames at rest, B from a coarse search.
 
 
-POINTS_USED = 60  # Points of each trial that the grid search uses (chosen)
+POINTS_USED = 60  # Points of each trial that the search uses (chosen)
 
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
@@ -434,71 +435,45 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     return trial_effects
 
 
-def candidates(
-    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor
-) -> list[tuple[float, Floats, Floats]]:
-    """Starting values, best first: misfit, scaled parameters and trial effects. For each exponent and each further
-    starting value, every vine takes the B with the least misfit of its trials; the release of each trial is scanned at
-    the same time.
+def candidates(layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor) -> list[Floats]:
+    """Starting values of the scaled parameters, those of least misfit first, for each combination of further starting
+    values. The release of each trial is scanned at the same time.
     """
     trial_effects = initial_trial_effects(data)
     start_values = [
         sorted({number.start, *number.further_starts}) if number.further_starts else [number.start]
         for number in layout.free
     ]
-    combined = list(itertools.islice(itertools.product(*start_values), 12))
     scored = []
-    for values in combined:
-        theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
-        starts = _scan_damping(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
-        for start in starts:
-            try:
-                releases, misfit = align(data, predictor, start, trial_effects)
-            except SimulationError:
-                continue
-            scored.append((float(np.sum(misfit)), start, releases))
-    return sorted(scored, key=lambda scored_start: scored_start[0])
+    for values in itertools.islice(itertools.product(*start_values), 12):
+        start = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
+        with suppress(SimulationError):
+            if DAMPING in layout.keys:
+                start = _with_best_damping(layout, data, predictor, start, trial_effects)
+            scored.append((float(np.sum(align(data, predictor, start, trial_effects)[1])), start))
+    return [start for _, start in sorted(scored, key=lambda scored_start: scored_start[0])]
 
 
-def _scan_damping(
+def _with_best_damping(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
-) -> list[Floats]:
-    """For each exponent the best B of every vine."""
-    speed = np.array([middle_speed(trial_data) for trial_data in data])
-    drive = np.array([_driving_force_N(trial_data) for trial_data in data])
-    free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
-    key = layout.keys.index(DAMPING)
-    damping_index = layout.index[:, key]
-    starts = []
-    names = layout.model.parameter_names
-    fixed_n = float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
-    # (0.15, 0.37, 0.65, 1.0): exponents of the grid (chosen)
-    for n in (0.15, 0.37, 0.65, 1.0) if free_n else (fixed_n,):
-        values = theta.copy()
-        values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
-        guess = {
-            k: float(np.exp(np.mean(np.log(drive[damping_index == k]) - n * np.log(speed[damping_index == k]))))
-            for k in np.unique(damping_index)
-        }
-        best: dict[int, tuple[float, float]] = {}
-        # Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
-        for factor in (0.2, 0.4, 0.6, 0.8, 0.95, 1.1):
-            for k, B in guess.items():
-                free = layout.free[k]
-                values[k] = free.to_scaled(float(np.clip(factor * B, free.lower, free.upper)))
-            try:
-                _, misfit = align(data, predictor, values, trial_effects)
-            except SimulationError:
-                continue
-            for k in guess:
-                score = float(np.sum(misfit[damping_index == k]))
-                if k not in best or score < best[k][0]:
-                    best[k] = (score, float(values[k]))
-        values = values.copy()
-        for k, (_, B) in best.items():
-            values[k] = B
-        starts.append(values)
-    return starts
+) -> Floats:
+    """Starting values with the B of every vine that has the least misfit of its trials, of a few that balance part of
+    the drive at the observed speed.
+    """
+    exponents = layout.rows(theta)[0][:, layout.model.parameter_names.index(EXPONENT)]
+    log_B = np.log(list(map(_driving_force_N, data))) - exponents * np.log(list(map(middle_speed, data)))
+    of_trial, theta = layout.index[:, layout.keys.index(DAMPING)], theta.copy()
+    best = dict.fromkeys(np.unique(of_trial), (math.inf, 0.0))
+    for part in (0.2, 0.4, 0.6, 0.8, 0.95, 1.1):  # (chosen)
+        for k in best:
+            free = layout.free[k]
+            B = part * float(np.exp(np.mean(log_B[of_trial == k])))
+            theta[k] = free.to_scaled(float(np.clip(B, free.lower, free.upper)))
+        with suppress(SimulationError):
+            misfit = align(data, predictor, theta, trial_effects)[1]
+            best = {k: min(of, (float(np.sum(misfit[of_trial == k])), float(theta[k]))) for k, of in best.items()}
+    theta[list(best)] = [B for _, B in best.values()]
+    return theta
 
 
 def middle_speed(trial_data: FitTrial) -> float:

@@ -44,6 +44,7 @@ from vinetrack.inference.marginal_likelihood import (
     with_diagonal,
 )
 from vinetrack.inference.optimiser import (
+    MOST_ITERATIONS,
     FixedTerms,
     Solution,
     Watch,
@@ -63,8 +64,9 @@ from vinetrack.inference.sensitivity import (
     Predictor,
     align,
     candidates,
+    initial_trial_effects,
 )
-from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset, trial_costs
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset
 
 ALIKE = (5e-4, 1e-3)  # Between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
 
@@ -73,9 +75,9 @@ def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Wat
     """Solve from the starting values of least misfit from which the model can be simulated."""
     reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
-    for _, theta, trial_effects in candidates(predictor.layout, predictor.data, predictor)[:3]:
+    for theta in candidates(predictor.layout, predictor.data, predictor)[:3]:
         try:
-            return solve_from(predictor, theta, trial_effects, fixed_terms, watch=watch)
+            return solve_from(predictor, theta, fixed_terms, watch=watch)
         except SimulationError as error:
             reason = str(error)
     raise FitError(f"The model cannot be simulated from any starting values: {reason}")
@@ -84,13 +86,13 @@ def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Wat
 def solve_from(
     predictor: Predictor,
     theta: Floats,
-    trial_effects: Floats,
     fixed_terms: FixedTerms,
     **how: Any,
 ) -> Solution:
-    """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`;
-    `how` are options of `_solve_or_alike`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
+    """Solve from given parameters and the releases that suit them, with the initial noise and standard deviations of
+    `first_state`; `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
     """
+    trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     problem, state = make_problem(predictor, trial_effects), first_state(predictor.data, theta, trial_effects)
     if (rows := _part(predictor)).size:
         state, poor = _solved_for_part(predictor, problem, state, fixed_terms, rows, **how)
@@ -134,46 +136,37 @@ def _solve_or_alike(
     state: FitState,
     fixed_terms: FixedTerms,
     *,
-    once: bool = False,
-    **how: Any,
+    noise: tuple[float, Floats] | None = None,
+    most_iterations: int = MOST_ITERATIONS,
+    watch: Watch | None = None,
 ) -> Solution:
-    """Solve, and where the fit is poor, unless it is to be tried `once`, with trials that are alike: differences
-    between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials may differ
-    again, if that leads near the tracks.
+    """Solve; from bad starting values first with trials that are alike, and with the `noise` where it is known:
+    differences between trials in pressure and B would take up what the model can explain, and n is meaningless then.
+    Where they do all the same, the fit with trials that are alike stands.
     """
-    solution = solve(predictor, problem, state, fixed_terms, **how)
-    if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
-        return solution
-    try:
-        alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
-        solution = solve(predictor, problem, alike.state, fixed_terms, **how)
-        return alike if is_poor_fit(predictor, solution) else solution
-    except SimulationError:
-        return solution
+    # 1.5: χ² per point below which starting values are good (chosen)
+    if fixed_terms.spread is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points)):
+        return solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations, watch=watch)
+    how: dict[str, Any] = {"most_iterations": most_iterations, "least_decrease": 1.0, "watch": watch}
+    alike = solve(predictor, problem, state, FixedTerms(ALIKE, noise or fixed_terms.noise), **how)
+    # 4: steps that are left to trials that differ, at least (chosen)
+    state, left = replace(alike.state, spread=state.spread), max(most_iterations - alike.iterations, 4)
+    solution = solve(predictor, problem, state, fixed_terms, most_iterations=left, watch=watch)
+    return alike if is_poor_fit(predictor, solution) else solution
 
 
 def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, and with
-    trials that are alike: noise and differences between trials would take up what the model can explain. Shapes: theta
-    (n_free,).
+    are options of `_solve_or_alike`. Shapes: theta (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
     state = replace(before.state, theta=theta)
-    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
-    if fixed_terms.noise is None and cost(predictor, problem, state) >= 1.5 * float(np.sum(problem.points)):
-        # An apparently late release may be the action of the new effect: each trial starts at the one that fits best.
-        aligned, _ = align(predictor.data, predictor, theta, state.trial_effects)
-        here, there = (trial_costs(predictor, problem, each) for each in (state, replace(state, trial_effects=aligned)))
-        state = replace(state, trial_effects=np.where((there < here)[:, None], aligned, state.trial_effects))
-        noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
-        # 40: steps at fixed noise, at most (chosen)
-        state = replace(solve(predictor, problem, state, noise, most_iterations=40).state, spread=state.spread)
-    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
+    noise = state.rho, state.variance
+    return _solve_or_alike(predictor, problem, state, fixed_terms, noise=noise, **how)
 
 
 # ------------------------------------------------------------------------------

@@ -142,9 +142,9 @@ def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: F
     cross_products = predictor.products(columns)
     steps = (trial_effect_step(cross_products, problem, state, fixed_release=fixed) for fixed in (False, True))
     current_costs = trial_costs(predictor, problem, state, residuals_in(columns))
-    moved_effects = [limited_step(predictor, state.trial_effects, step) for step in steps]
-    candidates = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved_effects)]
-    residuals_of_candidates = zip(candidates[1:], predictor.residuals_of_each(state.theta, moved_effects), strict=True)
+    moved = [moved_effects(state.trial_effects, step) for step in steps]
+    candidates = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved)]
+    residuals_of_candidates = zip(candidates[1:], predictor.residuals_of_each(state.theta, moved), strict=True)
     costs = np.array(
         [
             current_costs,
@@ -156,22 +156,10 @@ def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: F
     return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
 
 
-def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
-    """Trial effects after a step, within the trust region: two frames for the release, 0.3 for a deviation. Shapes:
-    trial_effects, step (n_trials, 4) → (n_trials, 4).
-    """
-    largest_deviation_step = 0.3  # Largest step of a trial's deviations of pressure and ln B (chosen)
-    # 2.0: largest step of a release, frames (chosen)
-    largest_release_step = 2.0 * np.array([trial_data.frame_s for trial_data in predictor.data])
-    effects = trial_effects + step
-    effects[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(
-        step[:, RELEASE], -largest_release_step, largest_release_step
-    )
-    deviations = [PRESSURE, DAMPING_DEVIATION]
-    deviation_step = np.clip(step[:, deviations], -largest_deviation_step, largest_deviation_step)
-    effects[:, deviations] = np.clip(
-        trial_effects[:, deviations] + deviation_step, -LARGEST_DEVIATION, LARGEST_DEVIATION
-    )
+def moved_effects(trial_effects: Floats, step: Floats) -> Floats:
+    """Trial effects after a step. Shapes: trial_effects, step (n_trials, 4) → (n_trials, 4)."""
+    effects, deviations = trial_effects + step, [PRESSURE, DAMPING_DEVIATION]
+    effects[:, deviations] = np.clip(effects[:, deviations], -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return effects
 
 
@@ -197,69 +185,51 @@ def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
 LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)
 
 
-class ReleaseSearch:
-    """Global search for the releases during a fit. A release jumps where the trial's likelihood, its effects integrated
-    out, is higher.
+def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
+    """The state with releases at which the trials' likelihoods, their effects integrated out, are higher; None if there
+    are none. Of trials pressurised during the recording the trace shows the release.
     """
+    proposed = _by_linear_model(predictor, problem, state)
+    accepted = state if proposed is None else _confirmed(predictor, problem, state, proposed)
+    return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
 
-    def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
-        self.predictor, self.problem = predictor, problem
 
-    def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
-        """The state with likelier releases; None if there are none. The search leaves out trials pressurised during the
-        recording, whose release the trace shows, and trials recorded at rest with a misfit far above noise, which
-        another release would only compensate. Shapes: residuals (n_points,).
-        """
-        proposed = self._by_linear_model(state, residuals)
-        accepted = state if proposed is None else self._confirmed(state, proposed)
-        return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
-
-    def _by_linear_model(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
-        """The state with each trial at its likeliest release by the linear model; None if no trial moves."""
-        predictor, problem = self.predictor, self.problem
-        misfit = trial_costs(predictor, problem, state, residuals) * state.variance
-        misfit /= (1 - state.rho**2) * problem.points
-        # 30.0: mean squared residual of a trial, in variances of its noise, up to which its release is
-        # searched (chosen)
-        places = [
-            i
-            for i, trial_data in enumerate(predictor.data)
-            if not trial_data.pressurised_in_recording
-            and (not trial_data.shows_rest or misfit[i] < 30.0 * trial_data.noise_m**2)
-        ]
-        if not places:
-            return None
-        releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
-        jobs = predictor.jobs(state.theta, state.trial_effects)[places]
-        sensitivities = _release_sensitivities(predictor, jobs, releases)
-        trial_effects = state.trial_effects.copy()
-        centre, precision = trial_effect_prior(problem, state)
-        any_moved = False
-        for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
-            noise = state.rho, float(state.variance[i])
-            effects, gain = _best_release(
-                predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
-            )
-            if gain > LEAST_DECREASE:
-                trial_effects[i], any_moved = effects, True
-        return replace(state, trial_effects=trial_effects) if any_moved else None
-
-    def _confirmed(self, state: FitState, proposed: FitState) -> FitState:
-        """The state with those proposed effects that remain better after a few steps on simulated trajectories. Trials
-        without a proposal stay as they are.
-        """
-        rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
-        predictor, problem, (current, proposed) = subset(self.predictor, self.problem, rows, state, proposed)
-        # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
-        for _ in range(3):
-            proposed = optimise_trial_effects(predictor, problem, proposed)[0]
-        better = (
-            _trial_deviances(predictor, problem, proposed)
-            < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
+def _by_linear_model(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
+    """The state with each trial at its likeliest release by the linear model; None if no trial moves."""
+    places = [i for i, trial_data in enumerate(predictor.data) if not trial_data.pressurised_in_recording]
+    if not places:
+        return None
+    releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
+    jobs = predictor.jobs(state.theta, state.trial_effects)[places]
+    sensitivities = _release_sensitivities(predictor, jobs, releases)
+    trial_effects = state.trial_effects.copy()
+    centre, precision = trial_effect_prior(problem, state)
+    any_moved = False
+    for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
+        noise = state.rho, float(state.variance[i])
+        effects, gain = _best_release(
+            predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
         )
-        trial_effects = state.trial_effects.copy()
-        trial_effects[rows[better]] = proposed.trial_effects[better]
-        return replace(state, trial_effects=trial_effects)
+        if gain > LEAST_DECREASE:
+            trial_effects[i], any_moved = effects, True
+    return replace(state, trial_effects=trial_effects) if any_moved else None
+
+
+def _confirmed(predictor: Predictor, problem: MixedProblem, state: FitState, proposed: FitState) -> FitState:
+    """The state with those proposed effects that remain better after a few steps on simulated trajectories. Trials
+    without a proposal stay as they are.
+    """
+    rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
+    predictor, problem, (current, proposed) = subset(predictor, problem, rows, state, proposed)
+    # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
+    for _ in range(3):
+        proposed = optimise_trial_effects(predictor, problem, proposed)[0]
+    better = (
+        _trial_deviances(predictor, problem, proposed) < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
+    )
+    trial_effects = state.trial_effects.copy()
+    trial_effects[rows[better]] = proposed.trial_effects[better]
+    return replace(state, trial_effects=trial_effects)
 
 
 def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
