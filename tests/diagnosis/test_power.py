@@ -33,8 +33,8 @@ def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), noise_m=1e-4, ca
     return vt.predictive_inputs(trials[0]).model, trials, [500.0] * len(trials), spreads, (noise_m, 0.0), candidates
 
 
-def power_with(design: tuple, **how: bool) -> Power:
-    return linear_power.power_of(planned_tests(*design)[0], **how)
+def power_with(design: tuple) -> Power:
+    return linear_power.power_of(planned_tests(*design)[0])
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0)
 def few():
     design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
     tests = planned_tests(*design)[0]
-    return design, tests, linear_power.power_of(tests, nonlinear=True)
+    return design, tests, linear_power.power_of(tests)
 
 
 def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_come_in_pairs_and_are_few(few):

@@ -82,8 +82,8 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) 
     threshold. Shape (n_sizes,) each.
     """
     multiples, ratios = list[float](), list[float]()
-    # (4.0, …): multiples of the size of one standard error at which the score is computed (chosen)
-    for multiple in (4.0, 7.0, 14.0, 28.0, 56.0):
+    # (7.0, …): multiples of the size of one standard error at which the score is computed (chosen)
+    for multiple in (7.0, 14.0, 28.0, 56.0):
         ratio = score_ratio(tests, shape_index, multiple * unit, start)
         # 2.0: ratio of an expected score to that of linear theory from which neither is used (chosen)
         if not 0 < ratio < 2.0:
@@ -156,12 +156,10 @@ def power_of(
     tests: MisfitTests,
     not_testable: Mapping[str, Remark] | None = None,
     inputs: Sequence[PowerInput] = (),
-    *,
-    nonlinear: bool = False,
     only: str = "",
 ) -> Power:
     """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
-    start = noiseless_start(tests.fit) if nonlinear else None
+    start = noiseless_start(tests.fit)
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
     normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
     known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests)
@@ -181,7 +179,7 @@ def power_of(
 
 def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
     """Compute at which sizes the trials of a fit can detect one candidate among all others; None where none can."""
-    return next(iter(power_of(tests, nonlinear=True, only=name).effects), None)
+    return next(iter(power_of(tests, only=name).effects), None)
 
 
 def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
@@ -195,13 +193,14 @@ def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
 
 
 def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
-    """Indices of the shapes that represent an effect: the middle small step, else all finite sizes, the largest last;
-    none where no trial has information about it.
+    """Indices of the shapes that represent an effect, of one size for all vines or days: the middle small step, else all
+    finite sizes, the largest last; none where no trial has information about it.
     """
-    has_information = np.diag(tests.scores.information) > 0
-    indices = [k for k, of in enumerate(tests.products.effects) if of == name and has_information[k]]
-    small = [k for k in indices if not tests.products.shapes[k].whole]
-    return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(tests.products.shapes[k].step))
+    shapes, has_information = tests.products.shapes, np.diag(tests.scores.information) > 0
+    for_all = [k for k, shape in enumerate(shapes) if shape.effect.name == name and not shape.group]
+    indices = [k for k in for_all if has_information[k]]
+    small = [k for k in indices if not shapes[k].whole]
+    return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(shapes[k].step))
 
 
 def _ends(shape: CandidateShape) -> tuple[float, float]:
@@ -221,13 +220,11 @@ def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
 def _effect_power(
     tests: MisfitTests,
     effect: Effect,
-    start: Fit | None,
+    start: Fit,
     null_scores: Floats,
     inflation: Floats,
 ) -> EffectPower | None:
-    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %; those of finite
-    size from linear theory, without `start`.
-    """
+    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %."""
     typical = typical_shapes(tests, effect.name)
     if not typical:
         return None
@@ -238,7 +235,7 @@ def _effect_power(
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
     sizes = np.array([one.step for one in shapes] if shape.whole else [math.copysign(1 / root[typical[0]], far)])
     scores = information[typical] * sizes[:, None] / root
-    if start is not None and not shape.whole:
+    if not shape.whole:
         unit = float(sizes[0])
         sizes, ratios = score_ratios(tests, typical[0], unit, start)
         scores = scores[0] * (ratios * sizes / unit)[:, None]
@@ -381,11 +378,13 @@ def _interval_widths(fit: Fit) -> tuple[NumberWidth, ...]:
 # and between-trial scatter expected of them.
 
 
-def fitted_tests(fitted: Fit, candidates: Sequence[str] | None = None) -> tuple[MisfitTests, dict[str, Remark]]:
+def fitted_tests(
+    fitted: Fit, candidates: Sequence[str] | None = None, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND
+) -> tuple[MisfitTests, dict[str, Remark]]:
     """Misfit tests of a fit with all candidates, and the reasons by name of those that cannot act with this sheet."""
     tried = candidates_of(fitted.model, candidates, fitted.model.user_effects)
     effects, not_testable = testable(tried, fitted.predictor.data)
-    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), not_testable
+    return misfit_tests(fitted, effects, level), not_testable
 
 
 def planned_tests(

@@ -22,7 +22,11 @@ from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.misfit_tests import MisfitTests
+from vinetrack.diagnosis.misfit_tests import (
+    FALSE_ALARM_LEVEL_FIRST_ROUND,
+    FALSE_ALARM_LEVEL_LATER_ROUNDS,
+    MisfitTests,
+)
 from vinetrack.diagnosis.result import ADEQUATE, Power, PowerInput, SimulatedRates
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS, catalogue
@@ -468,12 +472,15 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
     model = make_model(names, experiment.user_effects)
-    return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
+    # A diagnosis tests a model to which it has added effects at another level.
+    level = FALSE_ALARM_LEVEL_LATER_ROUNDS if added else FALSE_ALARM_LEVEL_FIRST_ROUND
+    return _measured_campaign(request, model, pairs, level, settings.candidates, settings.limits)
 
 
 def _measured_campaign(
-    request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None, limits: Limits
-) -> Campaign:
+    request: PowerRequest, model: Model, pairs: Pairs, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND,
+    candidates: Sequence[str] | None = None, limits: Limits = Limits(),
+) -> Campaign:  # fmt: skip
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
     fitted = fit(model, pairs, host=host, profile=False)
@@ -486,7 +493,7 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False)
     else:
         inputs = []
-    return *linear_power.fitted_tests(fitted, candidates), inputs, limits
+    return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits
 
 
 def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
@@ -541,9 +548,9 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
         elif isinstance(given, Fit):
             campaign = (*linear_power.fitted_tests(given), [], Limits())
         else:
-            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given))
         tests, not_testable, inputs, limits = campaign
-        now = linear_power.power_of(tests, not_testable, inputs, nonlinear=True)
+        now = linear_power.power_of(tests, not_testable, inputs)
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, tests, now, asked)))
