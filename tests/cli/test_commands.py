@@ -53,7 +53,7 @@ def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_shar
     done = run("check", one_vine(tmp_path / "v", rows))
     assert done.exit_code == 1
     assert all(word in done.output for word in ("trials.csv", "t0 and 199 more", "pressure_kPa", "9999"))
-    assert len(done.output.splitlines()) == 2
+    assert len(done.output.splitlines()) == 5  # with a line for each of four blank columns
 
 
 def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
@@ -133,8 +133,10 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path):
     assert [row["added"] for row in added] == ["", "air_drag"]
     assert len(ladder()) == 2  # that of the diagnosis stays
 
-    output = succeed("add", "reservoir_depletion", results, "--save")
-    assert "reservoir_depletion" in (folder / "experiment.yaml").read_text()
+    output = succeed("add", "reservoir_depletion+leak", results, "--save")
+    assert "γ" in output
+    assert "1/τ" in output
+    assert read_experiment_settings(folder / "experiment.yaml").model[-2:] == ("reservoir_depletion", "leak")
     assert command_for_results(folder, results) in output.replace("\n", " ")
     assert run("add", "reservoir_depletion", results).exit_code == 1
 

@@ -14,10 +14,12 @@ from test_pipeline import write_campaign
 
 from vinetrack.cli import commands
 from vinetrack.core.problems import ExperimentError, UserError
+from vinetrack.core.tables import write_csv
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
 from vinetrack.results import origin
+from vinetrack.results.folder_layout import TRIALS_COLUMNS, Results, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated
 
 ROOT = Path(__file__).parents[2]
@@ -194,6 +196,15 @@ def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     assert (paths[1] / "logs" / "run.log").is_file()
 
 
+@pytest.mark.parametrize(("statuses", "failed"), [("ok failed ok left_out", False), ("failed ok failed left_out", True)])
+def test_a_run_of_which_most_trials_failed_ends_with_the_reason_as_a_failure(tmp_path, statuses, failed):
+    rows = [{"trial": f"t{k}", "status": status, "reason": "why"} for k, status in enumerate(statuses.split())]
+    write_csv(Results(tmp_path).trials, table_of(TRIALS_COLUMNS, rows))
+    lines, is_failure = commands._run_lines(tmp_path)
+    assert is_failure == failed
+    assert lines[-failed].startswith(f"{statuses.count('failed')} of 3 trials failed, t{statuses.split().index('failed')}")
+
+
 @pytest.mark.slow
 @pytest.mark.pipeline
 def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
@@ -212,7 +223,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
     assert lines[-1].startswith(f"{verdict}: ")
     assert f"Report: {results / 'report.html'}" in lines
     assert {stage.done for stage in STAGES.values() if stage.done in lines} >= {"trials analysed", "report written"}
-    assert commands._run_lines(results)[-1] == lines[-1]
+    assert commands._run_lines(results)[0][-1] == lines[-1]
     assert sorted(path.name for path in elsewhere.iterdir()) == ["out"]
 
 

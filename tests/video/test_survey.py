@@ -65,8 +65,8 @@ def test_what_is_no_recording_is_an_error_at_its_place(tmp_path, fault):
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path, name):
     write_clip(tmp_path / name, 60, share=0.6)
-    assert check(tmp_path, name) == ["warning t0 video"]
-    (problem,) = check_experiment(tmp_path, Surveyor())
+    assert check(tmp_path, name) == ["warning t0 video", "error t0 video"]  # noise, in which nothing grows
+    problem, _ = check_experiment(tmp_path, Surveyor())
     assert 25 <= int(problem.message.split(":")[1].split()[0]) <= 40
 
 
@@ -105,7 +105,7 @@ def test_what_gives_no_scale_is_reported_once(tmp_path, case):
         ("from_px: [10, 30], via_px: [[50, 70]], to_px: [90, 30]", ["error axis"]),
         ("from_px: [1, 55], via_px: [[30, 63], [70, 63]], to_px: [95, 55]", ["error axis"]),
         ("from_px: [20, 20], via_px: [[60, 20]], to_px: [60, 50], width_mm: 30", ["error axis"]),
-        ("from_px: [5, 30], via_px: [[50, 34]], to_px: [90, 50], width_mm: 2", []),
+        ("from_px: [5, 30], via_px: [[50, 34]], to_px: [90, 50], width_mm: 2", ["error t0 video"]),
     ],
 )
 def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_path, given, found):

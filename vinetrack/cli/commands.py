@@ -72,30 +72,39 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
         check_before_run(*paths, say)
     run_chain(*paths, cores, say, verbose)
     to = Results(paths[1])
-    return _run_lines(to.folder), {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}
+    lines, failed = _run_lines(to.folder)
+    return lines, {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}, failed
 
 
-def _run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last.
-    They are kept, since reading a diagnosis takes most of a second.
+def _run_lines(folder: Path) -> tuple[list[str], bool]:
+    """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last,
+    or why there is none; and whether most trials failed. They are kept, since reading a diagnosis takes most of a
+    second.
     """
     from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
 
     results = Results(folder)
 
-    def summary() -> list[str]:
+    def summary() -> tuple[list[str], bool]:
         from vinetrack.narrative.diagnosis_text import table_lines
         from vinetrack.narrative.verdict_text import verdict_line
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-        failed = trials[trials["status"] == "failed"]
-        more = f" (and {len(failed) - 1} more, see the report)" if len(failed) > 1 else ""
-        first = (f"{row.trial} failed{more}: {row.reason}" for row in failed.head(1).itertuples())
-        lines = [*first, f"Report: {results.report}"]
-        if diagnosis is None or not diagnosis.verdict:
-            return [*lines, "" if diagnosis is None else diagnosis.explanation]
-        lines += table_lines(diagnosis, in_short=True)
-        return [*lines, *(f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11), verdict_line(diagnosis)]
+        status, named = trials["status"], trials.set_index("trial")["reason"]
+        failed, count = named[(status == "failed").to_numpy()], int((status != "left_out").sum())
+        first = " first" if len(failed) > 1 else ""
+        told = [
+            f"{len(failed)} of {count} trials failed, {name}{first}: {why}" for name, why in failed.head(1).items()
+        ]
+        most = len(failed) > count / 2
+        lines = [f"Report: {results.report}"] if most else [*told, f"Report: {results.report}"]
+        if diagnosis is not None and diagnosis.verdict:
+            lines += table_lines(diagnosis, in_short=True)
+            notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
+            lines += [*notes, verdict_line(diagnosis)]
+        elif diagnosis is not None and not most:
+            lines.append(diagnosis.explanation)
+        return ([*lines, *told], True) if most else (lines, False)
 
     state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
     return Kept(folder).made("lines", state, summary)
@@ -145,22 +154,23 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
 
 @command()
 def _add(effect: str, results: Path, save: bool, experiment: Path | None, report: Say) -> Answer:
-    """Add an effect to the model, refit, and show the error before and after."""
+    """Add an effect to the model, or several as A+B, refit, and show the error before and after."""
     from vinetrack.pages.draft_files import save_model
-    from vinetrack.pipeline.model_stage import add_effect
+    from vinetrack.pipeline.model_stage import add_effects
     from vinetrack.pipeline.workflow import command_for_results
     from vinetrack.results.folder_layout import read_source_experiment
 
     read = read_source_experiment(results, experiment)
-    own_files = [Path(effect)] if effect.endswith(".py") else []
+    names = [effect] if Path(effect).is_file() else effect.split("+")
+    own_files = [Path(name) for name in names if name.endswith(".py")]
     if save and any(file.resolve().parent != read.folder.resolve() for file in own_files):
         raise UserError(
             f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
         )
-    lines, ladder = add_effect(read, results, effect, report)
+    lines, ladder = add_effects(read, results, names, report)
     if save:
-        name = Path(effect).stem if own_files else effect
-        path = save_model(read.folder, [*read.settings.model, name], [file.name for file in own_files])
+        added = [Path(name).stem for name in names]
+        path = save_model(read.folder, [*read.settings.model, *added], [file.name for file in own_files])
         lines.append(f"Saved to {path}; to update all results: {command_for_results(read.folder, results)}")
     return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder}
 
@@ -333,8 +343,7 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
 
     check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))
-    head, *lines = str(power).splitlines()
-    lines = [f"{head}; what a fit absorbs is counted, which the linear theory of a verdict does not", *lines]
+    lines = str(power).splitlines()
     if figure is not None:
         write_figure(power.plot(), figure)
         lines.append(f"Figure: {figure}")

@@ -60,27 +60,29 @@ if TYPE_CHECKING:
 
 
 def add(
-    experiment: Experiment, tracks: Mapping[str, Track], name: str, report: Callable[[str], None]
+    experiment: Experiment, tracks: Mapping[str, Track], names: Sequence[str], report: Callable[[str], None]
 ) -> tuple[Fit, Fit, pd.DataFrame]:
-    """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
+    """Fit the model in use without and with some effects, and work out the ladder of both. Returns before, after, table
     (the ladder of errors, one row for each model).
     """
     user_effects = experiment.user_effects
     model = make_model(experiment.settings.model, user_effects)
-    if name.endswith(".py"):
-        user_effects = {**own_effects([name]), **user_effects}
-    effect = find_effect(Path(name).stem, user_effects)
-    if effect.name in model:
-        raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
-    check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
+    user_effects = {**own_effects([name for name in names if name.endswith(".py")]), **user_effects}
+    effects = [find_effect(Path(name).stem, user_effects) for name in names]
+    larger = model
+    for effect in effects:
+        if effect.name in larger:
+            raise EffectError(f"{effect.name} is in the model already: {' + '.join(larger.names)}.")
+        larger += effect
+    check_needs(larger, *(trial for trial in experiment.trials if trial.name in tracks))
     report("fitting the model as it is")
     candidates = candidates_of(model, experiment.settings.candidates, user_effects)
-    if effect not in candidates:
-        candidates = (*candidates, effect)
-    before = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
-    after = fit_with(before, effect, report)
+    candidates += tuple(effect for effect in effects if effect not in candidates)
+    before = after = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
+    for effect in effects:
+        after = fit_with(after, effect, report)
     report("errors before and after")
-    return before, after, ladder((before, after), ("", effect.name))
+    return before, after, ladder((before, after), ("", "+".join(effect.name for effect in effects)))
 
 
 def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:

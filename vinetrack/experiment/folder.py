@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core import tables
-from vinetrack.core.problems import ExperimentError, InputError, Problem
+from vinetrack.core.problems import ExperimentError, InputError, Problem, joined
 from vinetrack.core.records import Correction, Floats, Trial
 from vinetrack.core.units import pressure_text
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with_names
@@ -44,7 +44,7 @@ class Experiment:
     left_out: dict[str, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
     lines: dict[str, int] = field(default_factory=dict)
-    angle_blank: tuple[str, ...] = ()
+    blank: dict[str, tuple[str, ...]] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
 
@@ -55,12 +55,16 @@ class Experiment:
 
     @property
     def blank_notes(self) -> list[str]:
-        """Sentences that state which default blank cells stand for, where it affects the physics."""
-        blank = [name for name in self.angle_blank if name not in self.left_out]
-        if not blank:
-            return []
-        which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
-        return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+        """Sentences on `blank` cells by column: what they stand for, or the effects that cannot be tried."""
+        from vinetrack.effects import catalogue
+
+        notes, in_use = [], len(self.names) - len(self.left_out)
+        for column, names in self.blank.items():
+            untried = joined([name for name, effect in catalogue().items() if column in effect.needs])
+            said = COLUMNS[column].if_blank or (f"{untried} cannot be tried" if untried else "")
+            which = "all trials" if len(names) == in_use else f"{len(names)} trials, {names[0]} first"
+            notes += [f"{column} is blank ({which}): {said}"] if said else []
+        return notes
 
     @property
     def user_effects(self) -> Mapping[str, Effect]:
@@ -142,10 +146,16 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
-        angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
+        blank={column: names for column in COLUMNS if (names := _without(column, in_use))},
         columns=table.columns if table else (),
         recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
+
+
+def _without(column: str, rows: Sequence[Row]) -> tuple[str, ...]:
+    """The everting vines for which a column that may be blank or unknown is."""
+    can_be = COLUMNS[column].if_blank or COLUMNS[column].default == "unknown"
+    return tuple(row.name for row in rows if can_be and column not in row.values and row.travel_ratio == 2)
 
 
 def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:

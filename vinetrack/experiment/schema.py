@@ -32,9 +32,9 @@ from vinetrack.core.units import UNITS, Unit, convert, split_unit
 @dataclass(frozen=True, kw_only=True)
 class Column:
     """A column of the trial sheet. `field` is the field of `Trial` that holds the value, in SI where it is a number;
-    `measured` says how to measure it, `default` what a blank cell stands for, `slips` the units in which it may have
-    been written by mistake. `limit` is the form of a constraint on further trials; `condition_part` shows the value in
-    the name of a condition.
+    `measured` says how to measure it, `default` what a blank cell stands for, `if_blank` what that does to results,
+    `slips` the units in which it may have been written by mistake. `limit` is the form of a constraint on further
+    trials; `condition_part` shows the value in the name of a condition.
     """
 
     name: str
@@ -53,6 +53,7 @@ class Column:
     limit: str
     condition_part: str
     default: str
+    if_blank: str
     meaning: str
     measured: str
 

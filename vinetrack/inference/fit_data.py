@@ -339,8 +339,8 @@ def pairs_of(
             pairs.append((trial, tracks[trial.name]))
             continue
         if trial.track is None:
-            remedy = "run `vinetrack run`, or give its track" if tracks is None else "`trials.csv` has the reason"
-            left_out[trial.name] = f"its recording has not been tracked: {remedy}"
+            untracked = "its recording has not been tracked: run `vinetrack run`, or give its track"
+            left_out[trial.name] = untracked if tracks is None else "it failed, and `trials.csv` has the reason"
             continue
         try:
             pairs.append((trial, correct_frames(load_track(trial))))

@@ -282,8 +282,9 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     # 9.0: Δχ² above which an added effect is said to help (derived)
     helps = f"Δχ² = {gain:.1f}{'' if gain > 9.0 else ', no significant improvement'}"
     helps += "" if after.converged and gain >= 0 else "; the fit did not converge"
+    name = " + ".join(name for name in after.model.names if name not in before.model.names)
     lines = [
-        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {helps}",
+        f"{name} added to {' + '.join(before.model.names)}: {helps}",
         "",
         "position error",
         *_ladder_table(ladder),
@@ -295,7 +296,7 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     lines += table(body, ("", "before", "after", "unit"), align="<>><")
     errors = ladder["rms_left_out_m"].tolist()
     if errors[-1] >= errors[0] and gain > 9.0:
-        facts = {"name": after.model.names[-1], "without_m": errors[0], "with_m": errors[-1]}
+        facts = {"name": name, "without_m": errors[0], "with_m": errors[-1]}
         lines.append(f"! {sentence('left_out_error_does_not_fall', facts)}")
     return lines + [f"! {message}" for message in after.messages]
 

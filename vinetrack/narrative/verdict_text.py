@@ -272,11 +272,10 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
     if power.wary or not power.effects:
         return "sizes that trials would detect were not computed", str(power.wary)
     missed = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
-    unseen = [*missed, *power.not_testable]
     facts = {"seen": len(power.effects) - len(missed), "count": len(power.effects) + len(power.not_testable)}
-    # 6: effects that are named, at most (chosen)
-    named = unseen if len(unseen) <= 6 else [*unseen[:5], f"{len(unseen) - 5} others"]
-    return sentence("smaller_effects", facts), f"not even then: {listed_names(named)}" if named else ""
+    unseen = {"not even then": missed, "not testable with these trials": [*power.not_testable]}
+    named = [f"{why}: {listed_names(names)}" for why, names in unseen.items() if names]
+    return sentence("smaller_effects", facts), "; ".join(named)
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
@@ -310,7 +309,7 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         names = diagnosis.rounds[-1].answer_set
         return "correct the measurement, and run again", _remedies(names)
     if verdict == MISSING:
-        saved = " ".join(f"`vinetrack add {name} RESULTS --save`" for name in diagnosis.effects)
+        saved = f"`vinetrack add {'+'.join(diagnosis.effects)} RESULTS --save`"
         return f"keep it with {saved}, and measure its size by other means", _remedies(diagnosis.effects)
     if verdict == AMBIGUOUS:
         return "measure what tells them apart", _remedies(diagnosis.answer_set)

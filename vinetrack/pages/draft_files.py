@@ -144,7 +144,7 @@ def read_settings_text(folder: Path) -> str:
 def first_settings() -> str:
     """Return a template of `experiment.yaml`: keys without values, each with its meaning and how to measure it."""
     # What all trials of most campaigns share
-    keys = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
+    keys = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "film_density_kg_m3", "chamber_l")
     width, lines = max(map(len, keys)) + 3, []
     for key in keys:
         column = COLUMNS[key]

@@ -260,7 +260,8 @@ def page_state(folder: Path) -> dict[str, Any]:
     content = parse_yaml(draft.settings, SETTINGS).content
     sheet = draft.sheet
     # Columns that the page shows whether or not the sheet has them
-    optional = ["payload_g", "growth_angle_deg", "chamber_l", "inlet_mm", "exposure_us", "pressure_trace"]
+    optional = ["payload_g", "growth_angle_deg", "film_density_kg_m3", "chamber_l", "inlet_mm", "exposure_us"]
+    optional += ["pressure_trace"]
     known = {}
     for name in [name for name in COLUMNS if name not in ("trial", "video")]:
         units = [split_unit(name)[1], *other_units(name).values()]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -244,10 +244,12 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     return found
 
 
-def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> tuple[list[str], Any]:
-    """Add an effect to the model and refit. Returns lines, and the ladder of errors of both models."""
+def add_effects(
+    experiment: Experiment, folder: Path, names: Sequence[str], report: Report
+) -> tuple[list[str], Any]:
+    """Add effects to the model and refit. Returns lines, and the ladder of errors of both models."""
     tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))[0]}
-    before, after, table = add(experiment, tracks, name, report)
+    before, after, table = add(experiment, tracks, names, report)
     return added_in_words(before, after, table), table.to_dict("records")
 
 

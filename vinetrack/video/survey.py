@@ -380,9 +380,7 @@ class Surveyor:
                 opened[trial] = recording = inspect_recording(trial.video or Path())
                 of_trial = _recording_problems(trial, recording)
             except (RecordingError, OSError) as error:
-                what, remedy = (str(error), "") if isinstance(error, OSError) else (error.message, error.remedy)
-                name = trial.video.name if trial.video else ""
-                of_trial = [Problem(message=f"cannot be used: {what}", column="video", value=name, remedy=remedy)]
+                of_trial = [_unusable(trial, error)]
             if all(problem.severity != "error" for problem in of_trial):
                 sound.append(trial)
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
@@ -396,13 +394,23 @@ class Surveyor:
             axis = given_axis(trial, experiment.settings, m_per_px)
             facts = _stated_facts(trial, opened[trial], m_per_px, rel_sigma, axis)
             if trial in self.looked_into:
-                with contextlib.suppress(RecordingError):
+                try:
                     measurement = measure_recording(trial, experiment.settings, experiment.folder, self.keep)
                     facts = tracked_facts(trial, measurement)
                     of_trial = [*size_problems(trial, facts), *exposure_problems(trial, measurement.tracking)]
+                except RecordingError as error:
+                    told = math.isnan(m_per_px) or any(problem.column == "axis" for problem in of_scale)
+                    of_trial = [] if told else [_unusable(trial, error)]
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
             self.facts[trial] = facts
         return problems + of_scale
+
+
+def _unusable(trial: Trial, error: RecordingError | OSError) -> Problem:
+    """The problem of a recording that cannot be read or followed."""
+    what, remedy = (str(error), "") if isinstance(error, OSError) else (error.message, error.remedy)
+    name = trial.video.name if trial.video else ""
+    return Problem(message=f"cannot be used: {what}", column="video", value=name, remedy=remedy)
 
 
 def _one_per_condition(trials: list[Trial]) -> list[Trial]:

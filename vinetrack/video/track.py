@@ -66,6 +66,8 @@ class ArrivalTracker(Tracker):
         )  # fmt: skip
 
 
+NO_GROWTH = "see whether it shows this vine grow, name the right recording, or state the growth axis"
+
 # Asked in turn: the first that knows what moves follows it; the others return None.
 TRACKERS: list[Tracker] = [BodyTracker(), EdgeTracker(), ArrivalTracker()]
 
@@ -179,7 +181,7 @@ def track_pixels(
         axis = locate_axis(luma, small, axis, trial, diameter_px)
         followed = follow(Look(luma, axis, small, trial.travel_ratio, exposure_s * capture_fps))
     except RecordingError as error:
-        raise RecordingError(error.what, error.remedy, name) from error
+        raise RecordingError(error.what, error.remedy or NO_GROWTH, name) from error
     strip, random_px = followed.strip, followed.sigma_px
     # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
     shared_px = STABILISED_PX if strip.stabilised else 0.0, 0.04 * strip.axis.total_turn_rad
@@ -192,7 +194,7 @@ def track_pixels(
         if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
             what = "something moves, but its edge is too vague to be followed"
             raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
-        raise RecordingError("nothing moves along the axis", "check the recording, or give the axis", name)
+        raise RecordingError("nothing moves along the axis", NO_GROWTH, name)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
     notes, ending = _notes(frames, number, luma, trial, followed, quality, axis_given)
     notes += left_out
