@@ -196,13 +196,17 @@ def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     assert (paths[1] / "logs" / "run.log").is_file()
 
 
-@pytest.mark.parametrize(("statuses", "failed"), [("ok failed ok left_out", False), ("failed ok failed left_out", True)])
+@pytest.mark.parametrize(
+    ("statuses", "failed"), [("ok failed ok left_out", False), ("failed ok failed left_out", True)]
+)
 def test_a_run_of_which_most_trials_failed_ends_with_the_reason_as_a_failure(tmp_path, statuses, failed):
     rows = [{"trial": f"t{k}", "status": status, "reason": "why"} for k, status in enumerate(statuses.split())]
     write_csv(Results(tmp_path).trials, table_of(TRIALS_COLUMNS, rows))
     lines, is_failure = commands._run_lines(tmp_path)
     assert is_failure == failed
-    assert lines[-failed].startswith(f"{statuses.count('failed')} of 3 trials failed, t{statuses.split().index('failed')}")
+    assert lines[-failed].startswith(
+        f"{statuses.count('failed')} of 3 trials failed, t{statuses.split().index('failed')}"
+    )
 
 
 @pytest.mark.slow

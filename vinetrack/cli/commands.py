@@ -93,9 +93,7 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
         status, named = trials["status"], trials.set_index("trial")["reason"]
         failed, count = named[(status == "failed").to_numpy()], int((status != "left_out").sum())
         first = " first" if len(failed) > 1 else ""
-        told = [
-            f"{len(failed)} of {count} trials failed, {name}{first}: {why}" for name, why in failed.head(1).items()
-        ]
+        told = [f"{len(failed)} of {count} trials failed, {name}{first}: {why}" for name, why in failed.head(1).items()]
         most = len(failed) > count / 2
         lines = [f"Report: {results.report}"] if most else [*told, f"Report: {results.report}"]
         if diagnosis is not None and diagnosis.verdict:

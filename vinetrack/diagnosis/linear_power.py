@@ -193,8 +193,8 @@ def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
 
 
 def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
-    """Indices of the shapes that represent an effect, of one size for all vines or days: the middle small step, else all
-    finite sizes, the largest last; none where no trial has information about it.
+    """Indices of the shapes that represent an effect of one size for all vines: the middle small step, else all finite
+    sizes, the largest last; none where no trial has information about it.
     """
     shapes, has_information = tests.products.shapes, np.diag(tests.scores.information) > 0
     for_all = [k for k, shape in enumerate(shapes) if shape.effect.name == name and not shape.group]

@@ -244,9 +244,7 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     return found
 
 
-def add_effects(
-    experiment: Experiment, folder: Path, names: Sequence[str], report: Report
-) -> tuple[list[str], Any]:
+def add_effects(experiment: Experiment, folder: Path, names: Sequence[str], report: Report) -> tuple[list[str], Any]:
     """Add effects to the model and refit. Returns lines, and the ladder of errors of both models."""
     tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))[0]}
     before, after, table = add(experiment, tracks, names, report)

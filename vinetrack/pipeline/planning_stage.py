@@ -479,7 +479,7 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
 
 def _measured_campaign(
     request: PowerRequest, model: Model, pairs: Pairs, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND,
-    candidates: Sequence[str] | None = None, limits: Limits = Limits(),
+    candidates: Sequence[str] | None = None, limits: Limits | None = None,
 ) -> Campaign:  # fmt: skip
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
@@ -493,7 +493,7 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False)
     else:
         inputs = []
-    return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits
+    return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits or Limits()
 
 
 def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
