@@ -51,7 +51,7 @@ from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.diagnosis_tables import all_steps
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
-from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
+from vinetrack.tracks.frame_timing import confirmed, longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -173,8 +173,11 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     """Return a sentence for each column of the sheet that recordings or speeds contradict, by its name."""
     noted: dict[str, list[str]] = {}
-    for trial, _ in pairs:
-        for entry in read_json(results.analysed(trial.name)).get("contradictions", []):
+    content = {trial: read_json(results.analysed(trial.name)) for trial, _ in pairs}
+    found = [(trial, entry) for trial, seen in content.items() for entry in seen.get("contradictions", [])]
+    sure = confirmed([(trial, entry["column"]) for trial, entry in found], content)
+    for trial, entry in found:
+        if entry.get("code") == "scale" or (trial.vine, entry["column"]) in sure:
             noted.setdefault(entry["column"], []).append(f"{trial.name}: {entry['reason']}")
     sentences = {}
     for column, (first, *others) in noted.items():

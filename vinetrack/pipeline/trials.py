@@ -124,7 +124,7 @@ def _of_recording(
     seen["n_pictures"] = int(seen["n_corners"] > 0)
     axis = axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px}
     axis |= {"shake_px": tracking.shake_px.round(2)} if np.any(tracking.shake_px) else {}
-    contradictions = [{"column": problem.column, "reason": problem.reason} for problem in problems]
+    contradictions = [{key: getattr(problem, key) for key in ("code", "column", "reason")} for problem in problems]
     view = {"calibration": seen, "axis": axis, "contradictions": contradictions}
     return with_pressure_trace(trial, track), scale | {"tube_width_mm": mm_per_px * tracking.tube_width_px}, view
 

@@ -27,7 +27,7 @@ from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.tracks.frame_timing import mean_speed
+from vinetrack.tracks.frame_timing import confirmed, mean_speed
 from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through, find_growth_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.edge import tube_strip
@@ -286,7 +286,8 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
         remedy = "diameter_mm and length_mm are swapped"
     elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
         both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
-        return [_problem("diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
+        remedy = "check the scale: calibration, mm_per_px"
+        return [replace(_problem("diameter_mm", diameter_mm, both, width, remedy), code="scale")]
     problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
     return [*problems, *([_problem("length_mm", length_mm, growth_text, growth, remedy)] if growth_too_long else [])]
 
@@ -298,7 +299,8 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
     allowed_px = 3.0  # Difference of the blur lengths of stated and seen exposure (measured)
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
-    off = difference_px > allowed_px and max(stated / seen, seen / stated) > ERROR_FACTOR
+    # A whole frame, the longest exposure that is tried, fits best where the edge changes its contrast as it moves.
+    off = difference_px > allowed_px and max(stated / seen, seen / stated) > ERROR_FACTOR and seen < 1
     if not (off and trial.exposure_s > 0):
         return []
     stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
@@ -385,7 +387,7 @@ class Surveyor:
                 sound.append(trial)
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
         of_scale, calibrations = _scale_problems(experiment.settings, experiment.folder, opened)
-        self.looked_into = _one_per_condition(sound)
+        self.looked_into, seen = _one_per_condition(sound), list[tuple[Trial, Problem]]()
         for trial in progress(sound, "looking into recordings"):
             of_trial, m_per_px, rel_sigma = [], trial.m_per_px, math.nan
             scale = calibrations.get((opened[trial].width, opened[trial].height))
@@ -401,8 +403,14 @@ class Surveyor:
                 except RecordingError as error:
                     told = math.isnan(m_per_px) or any(problem.column == "axis" for problem in of_scale)
                     of_trial = [] if told else [_unusable(trial, error)]
-            problems += [replace(problem, trial=trial.name) for problem in of_trial]
+            seen += [(trial, problem) for problem in of_trial]
             self.facts[trial] = facts
+        sure = confirmed([(trial, problem.column) for trial, problem in seen], self.looked_into)
+        problems += [
+            replace(problem, trial=trial.name)
+            for trial, problem in seen
+            if problem.severity == "error" or problem.code == "scale" or (trial.vine, problem.column) in sure
+        ]
         return problems + of_scale
 
 
