@@ -216,7 +216,10 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
     psi = 6.894757
     typed = replace(vine, pressure_Pa=vine.pressure_Pa / psi, yield_pressure_Pa=vine.yield_pressure_Pa / psi)
     pairs = [(replace(typed, name=name), steady) for name in "ab"]
-    narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
+    narrow = {"code": "size", "column": "diameter_mm"}
+    narrow |= {"reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
+    write_json(results.analysed("a"), {"row": {}, "contradictions": [narrow]})
+    assert sheet_contradictions(results, right) == {}  # the other recording of this vine agrees with the sheet
     for name in "ab":
         write_json(results.analysed(name), {"row": {}, "contradictions": [narrow]})
     seen = sheet_contradictions(results, pairs)

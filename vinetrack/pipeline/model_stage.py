@@ -177,7 +177,7 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     found = [(trial, entry) for trial, seen in content.items() for entry in seen.get("contradictions", [])]
     sure = confirmed([(trial, entry["column"]) for trial, entry in found], content)
     for trial, entry in found:
-        if entry.get("code") == "scale" or (trial.vine, entry["column"]) in sure:
+        if entry.get("code") != "size" or (trial.vine, entry["column"]) in sure:
             noted.setdefault(entry["column"], []).append(f"{trial.name}: {entry['reason']}")
     sentences = {}
     for column, (first, *others) in noted.items():

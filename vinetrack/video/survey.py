@@ -287,7 +287,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
         both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
         remedy = "check the scale: calibration, mm_per_px"
-        return [replace(_problem("diameter_mm", diameter_mm, both, width, remedy), code="scale")]
+        return [_problem("diameter_mm", diameter_mm, both, width, remedy, code="scale")]
     problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
     return [*problems, *([_problem("length_mm", length_mm, growth_text, growth, remedy)] if growth_too_long else [])]
 
@@ -320,11 +320,11 @@ def _factor(ratio: float) -> str:
     return f"{max(ratio, 1 / ratio):.3g}"
 
 
-def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
+def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str, code: str = "size") -> Problem:
     """The problem of a stated size, an error beyond ERROR_FACTOR."""
     severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
     return Problem(
-        message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy,
+        code, f"differs: {seen}", column, severity=severity, value=f"{stated_mm:g}", remedy=remedy,
         of_a_measurement=True,
     )  # fmt: skip
 
@@ -409,7 +409,7 @@ class Surveyor:
         problems += [
             replace(problem, trial=trial.name)
             for trial, problem in seen
-            if problem.severity == "error" or problem.code == "scale" or (trial.vine, problem.column) in sure
+            if problem.severity == "error" or problem.code != "size" or (trial.vine, problem.column) in sure
         ]
         return problems + of_scale
 
