@@ -37,7 +37,8 @@ docs: $(STAMP)  ## the documentation with the Python interface as a site, build/
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
 	@$(BIN)/mkdocs build --quiet --strict
 
-# The stamp is written last: an installation that was broken off starts again.
+# The stamp is written last: an installation that was broken off starts again. The package is installed by its path,
+# which Python prefers to a folder without it: a script beside a clone named vinetrack would else take that for it.
 $(STAMP): requirements.lock pyproject.toml
 	@python=''; for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3; do \
 	  if "$$candidate" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; \
@@ -49,5 +50,6 @@ $(STAMP): requirements.lock pyproject.toml
 	echo "Setting up .venv with $$("$$python" --version), about a minute the first time."; \
 	rm -f $(STAMP); $(BIN)/python -c '' 2>/dev/null || "$$python" -m venv --clear .venv
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
+	  --config-settings editable_mode=compat --editable .
 	@touch $(STAMP)
