@@ -168,6 +168,8 @@ def test_an_empty_column_takes_the_unit_of_the_notes_and_a_bare_number_that_of_t
     rows = [ROWS[0], ROWS[1] | {"pressure_kPa": "30"}, ROWS[2]]
     placed, _ = draft.place_block(table, COLUMNS, rows, 0, "pressure_kPa")
     assert placed == [(2, "pressure_kPa", "36.5422"), (0, "pressure_kPa", "24.1317")]
+    placed, told = draft.place_block("d15_30kPa_1\t30", COLUMNS, rows, 0, "pressure_kPa")
+    assert (placed, len(told)) == ([], 1)  # it stands there already; the two others have no line
 
 
 def test_what_matches_nothing_is_named_and_changes_nothing():

@@ -377,16 +377,16 @@ def place_block(
                     given.setdefault(name, []).append((row, cell, value_and_unit(cell, name)[1]))
                 except InputError as error:
                     notes.append(f"“{cell}” {error}: left out.")
-    for name, found in given.items():
+    for name, of_name in given.items():
         # A number without a unit has that of the others; a column in which nothing stands takes it over.
-        column, said = column_of(name, columns), {unit for _, _, unit in found if unit}
+        column, said = column_of(name, columns), {unit for _, _, unit in of_name if unit}
         name = f"{quantity(name)}_{said.pop()}" if len(said) == 1 else name
         column = column if any(row.get(column) for row in rows) else name
-        placed += [(row, column, in_unit_of(column, name, cell, decimal)) for row, cell, _ in found]
+        placed += [(row, column, in_unit_of(column, name, cell, decimal)) for row, cell, _ in of_name]
     without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
     if name_place is not None and placed and without:
         notes.append(f"No line for {', '.join(without)}: left as they are.")
-    return placed, notes
+    return [one for one in placed if one[0] == SHARED_ROW or rows[int(one[0])].get(one[1]) != one[2]], notes
 
 
 def _header_words(columns: Sequence[str]) -> dict[str, str]:

@@ -19,7 +19,7 @@ import numpy as np
 from markupsafe import Markup
 
 from vinetrack.core.units import display_unit, interval, number, pressure_text, with_error
-from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
+from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
@@ -38,7 +38,6 @@ from vinetrack.narrative.verdict_text import (
     expected_text,
     is_finite,
     listed_names,
-    settled_rows,
     spaced_name,
     verdict_sentence,
     verdict_table,
@@ -474,19 +473,6 @@ def model_errors(table: pd.DataFrame) -> str:
     )
 
 
-def final_errors(diagnosis: Diagnosis) -> str:
-    """Return the position errors of the final model of a diagnosis as a sentence; blank without its ladder."""
-    if diagnosis.ladder is None or not len(diagnosis.ladder):
-        return ""
-    last = settled_rows(diagnosis.ladder).iloc[-1]
-    inside, outside = (number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m"))
-    adequate = f"; an adequate model would be off by {expected}" if (expected := expected_text(*last[EXPECTED])) else ""
-    return (
-        f"With {listed_names(diagnosis.effects)} the error of the model is {inside} mm, and {outside} mm on "
-        f"conditions left out of the fit{adequate} (root mean square)."
-    )
-
-
 # ------------------------------------------------------------------------------
 # What the report shows of a results folder, and the page.
 
@@ -596,7 +582,7 @@ def build_report(content: dict[str, Any]) -> str:
     }
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
-    in_templates = (rows, bounds_text, listed_names, expected_text, model_errors, final_errors)
+    in_templates = (rows, bounds_text, listed_names, expected_text, model_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
