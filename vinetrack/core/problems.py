@@ -6,6 +6,7 @@ remarks on results: a reason, a warning or a note as a code with its numbers; `v
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from importlib import import_module
@@ -98,6 +99,14 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
         return lines
     errors = sum(problem.severity == "error" for problem in remaining)
     return [*lines[: limit - 1], f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"]
+
+
+def confirmed(found: Iterable[tuple[str, str]], vines: Iterable[str]) -> set[tuple[str, str]]:
+    """Vine and column of what several recordings of a vine contradict, or its only one: a wrong number of the sheet
+    contradicts all; where one alone does, it was not followed well. `vines` are those of all recordings.
+    """
+    recordings = Counter(vines)
+    return {pair for pair, count in Counter(found).items() if count >= min(2, recordings[pair[0]])}
 
 
 def _one_line(text: str) -> str:

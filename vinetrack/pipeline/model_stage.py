@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import INTERNAL_ERROR, remark
+from vinetrack.core.problems import INTERNAL_ERROR, confirmed, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
@@ -51,7 +51,7 @@ from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.diagnosis_tables import all_steps
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
-from vinetrack.tracks.frame_timing import confirmed, longer_than_stated, mean_speed
+from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,7 +175,7 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     noted: dict[str, list[str]] = {}
     content = {trial: read_json(results.analysed(trial.name)) for trial, _ in pairs}
     found = [(trial, entry) for trial, seen in content.items() for entry in seen.get("contradictions", [])]
-    sure = confirmed([(trial, entry["column"]) for trial, entry in found], content)
+    sure = confirmed([(trial.vine, entry["column"]) for trial, entry in found], [trial.vine for trial in content])
     for trial, entry in found:
         if entry.get("code") != "size" or (trial.vine, entry["column"]) in sure:
             noted.setdefault(entry["column"], []).append(f"{trial.name}: {entry['reason']}")

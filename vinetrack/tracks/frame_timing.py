@@ -12,14 +12,13 @@ noise may have heavy tails. Outliers are rejected afterwards.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.problems import Remark, remark
+from vinetrack.core.problems import Remark, confirmed, remark
 from vinetrack.core.records import Floats, Indices, Track, Trial, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
@@ -257,17 +256,9 @@ def mean_speed(track: Track) -> float:
     return float(travel_m[late] - travel_m[early]) / duration_s if duration_s > 0 else np.nan
 
 
-def confirmed(found: Iterable[tuple[Trial, str]], looked_into: Iterable[Trial]) -> set[tuple[str, str]]:
-    """Vine and column of what several recordings contradict, or the only one: a wrong number of the sheet contradicts
-    all, and where one alone does its edge was not followed well.
-    """
-    recordings, times = Counter(trial.vine for trial in looked_into), Counter((t.vine, column) for t, column in found)
-    return {(vine, column) for (vine, column), count in times.items() if count >= min(2, recordings[vine])}
-
-
 def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
     """Say which tracks are longer than their vine, whose tip cannot run farther, as a payload can that leaves it; blank
-    where none is, or where one of several alone is: a wrong length makes several too long.
+    where none is, or not surely.
     """
     travels: list[tuple[Trial, float]] = []
     for trial, track in pairs:
@@ -277,8 +268,8 @@ def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
             travels.append((trial, float(np.quantile(position_m, 0.99) - np.median(position_m[:3]))))
     # 1.05: travel, in lengths of the vine, that an error of length or scale of a few per cent leaves (chosen)
     longer = [(travel_m / one.length_m, one, travel_m) for one, travel_m in travels if travel_m > 1.05 * one.length_m]
-    sure = confirmed([(one, "") for _, one, _ in longer], [one for one, _ in travels])
-    longer = [entry for entry in longer if (entry[1].vine, "") in sure]
+    sure = confirmed([(one.vine, "length_mm") for _, one, _ in longer], [one.vine for one, _ in travels])
+    longer = [entry for entry in longer if (entry[1].vine, "length_mm") in sure]
     if not longer:
         return Remark()
     _, trial, travel_m = max(longer, key=lambda one: one[0])

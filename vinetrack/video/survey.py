@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import Problem
+from vinetrack.core.problems import Problem, confirmed
 from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.tracks.frame_timing import confirmed, mean_speed
+from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through, find_growth_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.edge import tube_strip
@@ -277,8 +277,8 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     width_off = abs(width - 1) > 0.08 + 3.0 * sigma
     # 0.06: relative excess of growth over length that is allowed (measured)
     growth_too_long = growth > 1 + 0.06
-    width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
-    growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
+    width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width):.3g}"
+    growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth):.3g}"
     remedy = "check it, its unit and the scale, or write compare_sizes: no where only part of the tube is seen"
     # 0.2, 0.1: difference from 1 of a ratio that may be of swapped sizes, and of the logarithms of two factors that
     # are the same (chosen)
@@ -286,10 +286,11 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
         remedy = "diameter_mm and length_mm are swapped"
     elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
         both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
-        remedy = "check the scale: calibration, mm_per_px"
-        return [_problem("diameter_mm", diameter_mm, both, width, remedy, code="scale")]
-    problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
-    return [*problems, *([_problem("length_mm", length_mm, growth_text, growth, remedy)] if growth_too_long else [])]
+        return [_differs("scale", "diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
+    problems = [_differs("size", "diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
+    if growth_too_long:
+        problems.append(_differs("size", "length_mm", length_mm, growth_text, growth, remedy))
+    return problems
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
@@ -300,33 +301,27 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
     # A whole frame, the longest exposure that is tried, fits best where the edge changes its contrast as it moves.
-    off = difference_px > allowed_px and max(stated / seen, seen / stated) > ERROR_FACTOR and seen < 1
+    off = difference_px > allowed_px and _factor(stated / seen) > ERROR_FACTOR and seen < 1
     if not (off and trial.exposure_s > 0):
         return []
-    stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
-    message = (
-        f"differs: the edge is blurred as by {number(seen_us, 2)} µs, a factor {_factor(stated / seen)}, where it "
-        f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
-    )
-    problem = Problem(
-        message=message, severity="error" if difference_px > 2 * allowed_px else "warning", column="exposure_us",
-        value=f"{stated_us:g}", remedy="check exposure_us, its unit and capture_fps", of_a_measurement=True,
-    )  # fmt: skip
-    return [problem]
+    stated_us, ratio = 1e6 * trial.exposure_s, stated / seen
+    blur = f"the edge is blurred as by {number(stated_us / ratio, 2)} µs, a factor {_factor(ratio):.3g}"
+    message = f"{blur}, where it moves {number(tracking.fast_px_per_frame, 2)} px a frame"
+    remedy = "check exposure_us, its unit and capture_fps"
+    problem = _differs("exposure", "exposure_us", stated_us, message, ratio, remedy)
+    return [problem if difference_px > 2 * allowed_px else replace(problem, severity="warning")]
 
 
-def _factor(ratio: float) -> str:
-    """The larger of a ratio and its inverse, in words."""
-    return f"{max(ratio, 1 / ratio):.3g}"
+def _factor(ratio: float) -> float:
+    """The larger of a ratio and its inverse."""
+    return max(ratio, 1 / ratio)
 
 
-def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str, code: str = "size") -> Problem:
-    """The problem of a stated size, an error beyond ERROR_FACTOR."""
-    severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
-    return Problem(
-        code, f"differs: {seen}", column, severity=severity, value=f"{stated_mm:g}", remedy=remedy,
-        of_a_measurement=True,
-    )  # fmt: skip
+def _differs(code: str, column: str, stated: float, seen: str, ratio: float, remedy: str) -> Problem:
+    """The problem of a number that what is seen contradicts by a factor, an error beyond ERROR_FACTOR."""
+    known: dict[str, Any] = {"value": f"{stated:g}", "remedy": remedy, "of_a_measurement": True}
+    severity = "error" if _factor(ratio) > ERROR_FACTOR else "warning"
+    return Problem(code, f"differs: {seen}", column, severity=severity, **known)
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
@@ -405,20 +400,18 @@ class Surveyor:
                     of_trial = [] if told else [_unusable(trial, error)]
             seen += [(trial, problem) for problem in of_trial]
             self.facts[trial] = facts
-        sure = confirmed([(trial, problem.column) for trial, problem in seen], self.looked_into)
-        problems += [
-            replace(problem, trial=trial.name)
-            for trial, problem in seen
-            if problem.severity == "error" or problem.code != "size" or (trial.vine, problem.column) in sure
-        ]
+        found = [(trial.vine, one.column) for trial, one in seen if one.code == "size"]
+        sure = confirmed(found, [trial.vine for trial in self.looked_into])
+        for trial, one in seen:
+            if one.severity == "error" or one.code != "size" or (trial.vine, one.column) in sure:
+                problems.append(replace(one, trial=trial.name))
         return problems + of_scale
 
 
 def _unusable(trial: Trial, error: RecordingError | OSError) -> Problem:
     """The problem of a recording that cannot be read or followed."""
     what, remedy = (str(error), "") if isinstance(error, OSError) else (error.message, error.remedy)
-    name = trial.video.name if trial.video else ""
-    return Problem(message=f"cannot be used: {what}", column="video", value=name, remedy=remedy)
+    return Problem("unusable", f"cannot be used: {what}", "video", value=(trial.video or Path()).name, remedy=remedy)
 
 
 def _one_per_condition(trials: list[Trial]) -> list[Trial]:
