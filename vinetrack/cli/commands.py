@@ -86,23 +86,19 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
     results = Results(folder)
 
     def summary() -> tuple[list[str], bool]:
-        from vinetrack.narrative.diagnosis_text import table_lines
+        from vinetrack.narrative.diagnosis_text import failures_told, table_lines
         from vinetrack.narrative.verdict_text import verdict_line
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-        status, named = trials["status"], trials.set_index("trial")["reason"]
-        failed, count = named[(status == "failed").to_numpy()], int((status != "left_out").sum())
-        first = " first" if len(failed) > 1 else ""
-        told = [f"{len(failed)} of {count} trials failed, {name}{first}: {why}" for name, why in failed.head(1).items()]
-        most = len(failed) > count / 2
-        lines = [f"Report: {results.report}"] if most else [*told, f"Report: {results.report}"]
+        told, most = failures_told(trials)
+        lines = [f"Report: {results.report}"] if most or not told else [told, f"Report: {results.report}"]
         if diagnosis is not None and diagnosis.verdict:
             lines += table_lines(diagnosis, in_short=True)
             notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
             lines += [*notes, verdict_line(diagnosis)]
         elif diagnosis is not None and not most:
             lines.append(diagnosis.explanation)
-        return ([*lines, *told], True) if most else (lines, False)
+        return [*lines, told] if most else lines, most
 
     state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
     return Kept(folder).made("lines", state, summary)

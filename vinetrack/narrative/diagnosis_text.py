@@ -207,6 +207,17 @@ def status_tally(trials: pd.DataFrame) -> str:
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
+def failures_told(trials: pd.DataFrame) -> tuple[str, bool]:
+    """How many trials in use failed, and why the first did, blank if none; and whether these are most of them."""
+    in_use = trials[trials["status"] != "left_out"]
+    failed = in_use[in_use["status"] == "failed"]
+    first = " first" if len(failed) > 1 else ""
+    told = [
+        f"{_count(len(in_use), 'trial')} failed, {one.trial}{first}: {one.reason}" for one in failed[:1].itertuples()
+    ]
+    return "".join(f"{len(failed)} of {words}" for words in told), len(failed) > len(in_use) / 2
+
+
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
