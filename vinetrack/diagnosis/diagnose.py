@@ -139,8 +139,6 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
     explanation = " ".join(finished.explanation for finished in rounds)
     lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
     not_tried = lack_columns if any(finished.verdict == UNEXPLAINED for finished in rounds) else []
-    if not_tried:
-        explanation += " " + str(remark("not_tried", names=not_tried))
     return Diagnosis(
         rounds=rounds,
         effects=tuple(step.answer_names[0] for step in steps[:-1]),

@@ -44,21 +44,13 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
-from vinetrack.narrative.diagnosis_text import added_in_words, failures_told, proposal_lines
+from vinetrack.narrative.diagnosis_text import added_in_words, proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.diagnosis_tables import all_steps
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    measured_trials,
-    read_diagnosis,
-    read_json,
-    read_result,
-    table_of,
-)
+from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
@@ -78,7 +70,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
     try:
         diagnosis = diagnosed(job.experiment, results, pairs, job.say, fitted)
     except Exception as error:
-        reason = _reason(error) if pairs else failures_told(read_result(results.trials))[0] or _reason(error)
+        reason = _reason(error) if pairs else lines[0]
         explanation = f"No diagnosis could be made: {reason}"
         diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)

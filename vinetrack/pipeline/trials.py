@@ -30,7 +30,7 @@ from vinetrack.figures.registry import features
 from vinetrack.figures.style import blank
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
 from vinetrack.kinematics.summary import TrialError, TrialResult, condition_table, summarise_trial
-from vinetrack.narrative.diagnosis_text import damping_headline
+from vinetrack.narrative.diagnosis_text import damping_headline, failures_told
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.results.folder_layout import (
     KINEMATICS_COLUMNS,
@@ -219,8 +219,7 @@ def fit_damping(job: Job) -> list[str]:
     law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
     write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
     write_json(results.damping, law)
-    failed = int((table["status"] == "failed").sum())
-    return [f"{len(table)} trials, {failed} failed.", damping_headline(law)]
+    return [failures_told(table)[0] or f"{len(table)} trials.", damping_headline(law)]
 
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
