@@ -33,6 +33,15 @@ def folder(tmp_path):
     return two_vines(tmp_path)
 
 
+def test_blanks_that_matter_are_noted_with_what_they_stand_for_or_keep_from_being_tried(folder):
+    said = {note.split()[0]: note for note in read_experiment(folder).blank_notes}
+    assert list(said) == ["growth_angle_deg", "chamber_l", "inlet_mm", "film_density_kg_m3"]
+    assert "1200" in said["film_density_kg_m3"]
+    assert "reservoir_depletion" in said["chamber_l"]
+    stated = one(folder, growth_angle_deg="0", film_density_kg_m3="920", chamber_l="2", inlet_mm="6")
+    assert stated.blank_notes == []
+
+
 def test_a_row_becomes_a_trial_in_si_units(folder):
     def known(trial: Trial) -> dict[str, object]:
         return {name: value for name, value in vars(trial).items() if value == value}  # NaN equals nothing
