@@ -93,6 +93,9 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) 
         # 6.5: expected score from which no larger size is tried (chosen)
         if ratio * multiple > 6.5:
             break
+    # 0.1: departure from linear theory from which the score is computed at a smaller size as well (chosen)
+    if ratios and abs(ratios[0] - 1) > 0.1 and 0 < (ratio := score_ratio(tests, shape_index, 4.0 * unit, start)) < 2.0:
+        multiples, ratios = [4.0, *multiples], [ratio, *ratios]
     return unit * np.array(multiples or [7.0]), np.array(ratios or [1.0])
 
 
