@@ -93,6 +93,20 @@ def test_two_equivalent_effects_are_confused_with_each_other():
     assert "area_scale" in power["pressure_gain"].taken_for
 
 
+def test_the_size_of_an_effect_that_may_differ_between_vines_is_that_of_all_vines_alike():
+    model, trials, rates, *how = planned(2, candidates=("area_scale", "leak"))
+    thin = planned(2, diameter_mm="12", thickness_um="100")[1]
+    B = {trial.vine: damping_prior(trial.diameter_m, trial.thickness_m) for trial in (*trials, *thin)}
+    trials += [replace(trial, name=f"thin_{trial.name}") for trial in thin]
+    tests, _ = planned_tests(model.with_values({"eversion_damping.B": B}), trials, 2 * rates, *how)
+    (k,) = linear_power.typical_shapes(tests, "area_scale")
+    size = 4 * tests.scores.plain_sigma[k]
+    # Tested for one vine alone and put into both, it would have a few per cent of this score.
+    assert linear_power.score_ratio(tests, k, size, linear_power.noiseless_start(tests.fit)) == pytest.approx(
+        1, abs=0.2
+    )
+
+
 def test_power_is_unchanged_by_writing_and_reading(power):
     again = Power.from_json(json.loads(json.dumps(power.to_json())))
     assert again == power
