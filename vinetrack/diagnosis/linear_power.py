@@ -161,8 +161,10 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     only: str = "",
 ) -> Power:
-    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
-    start = noiseless_start(tests.fit)
+    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect. Of planned trials,
+    whose noise is stated, at finite sizes; every diagnosis computes that of measured ones, by linear theory.
+    """
+    start = None if tests.fit.options["held"].noise is None else noiseless_start(tests.fit)
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
     normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
     known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests)
@@ -223,11 +225,13 @@ def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
 def _effect_power(
     tests: MisfitTests,
     effect: Effect,
-    start: Fit,
+    start: Fit | None,
     null_scores: Floats,
     inflation: Floats,
 ) -> EffectPower | None:
-    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %."""
+    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %; those of finite
+    size from linear theory, without `start`.
+    """
     typical = typical_shapes(tests, effect.name)
     if not typical:
         return None
@@ -238,7 +242,7 @@ def _effect_power(
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
     sizes = np.array([one.step for one in shapes] if shape.whole else [math.copysign(1 / root[typical[0]], far)])
     scores = information[typical] * sizes[:, None] / root
-    if not shape.whole:
+    if start is not None and not shape.whole:
         unit = float(sizes[0])
         sizes, ratios = score_ratios(tests, typical[0], unit, start)
         scores = scores[0] * (ratios * sizes / unit)[:, None]
