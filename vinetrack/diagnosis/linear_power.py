@@ -82,8 +82,8 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) 
     threshold. Shape (n_sizes,) each.
     """
     multiples, ratios = list[float](), list[float]()
-    # (7.0, …): multiples of the size of one standard error at which the score is computed (chosen)
-    for multiple in (7.0, 14.0, 28.0, 56.0):
+    # (4.0, …): multiples of the size of one standard error at which the score is computed (chosen)
+    for multiple in (4.0, 7.0, 14.0, 28.0, 56.0):
         ratio = score_ratio(tests, shape_index, multiple * unit, start)
         # 2.0: ratio of an expected score to that of linear theory from which neither is used (chosen)
         if not 0 < ratio < 2.0:
@@ -93,9 +93,6 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) 
         # 6.5: expected score from which no larger size is tried (chosen)
         if ratio * multiple > 6.5:
             break
-    # 0.1: departure from linear theory from which the score is computed at a smaller size as well (chosen)
-    if ratios and abs(ratios[0] - 1) > 0.1 and 0 < (ratio := score_ratio(tests, shape_index, 4.0 * unit, start)) < 2.0:
-        multiples, ratios = [4.0, *multiples], [ratio, *ratios]
     return unit * np.array(multiples or [7.0]), np.array(ratios or [1.0])
 
 
