@@ -72,7 +72,7 @@ def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
     monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
     succeed("trials", folder, tmp_path / "r", "--log", log)
     assert "ZeroDivisionError: unforeseen" in log.read_text()
-    assert "1 trials, 1 failed" in run("model", folder, tmp_path / "r").output
+    assert "1 of 1 trial failed" in run("model", folder, tmp_path / "r").output
     monkeypatch.setattr("vinetrack.pipeline.trials.gather", Mock(side_effect=RuntimeError("the bottom fell out")))
     done = run("model", folder, tmp_path / "r", "--log", log)
     assert done.exit_code == 1
