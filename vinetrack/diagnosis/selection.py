@@ -53,6 +53,7 @@ from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 
 # ------------------------------------------------------------------------------
@@ -130,7 +131,8 @@ class Search:
             credible = [known for known in self.of_size(len(effects) + 1) if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
             model = tests.fit.model + shape.effect
-            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best)
+            near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
+            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best, once=near)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
             if fit is not None and gain >= FAILED_FIT_DELTA_CHI2:
                 self._keep_best(likelihood_ratio(self.before, (*effects, shape.effect), fit))

@@ -487,6 +487,7 @@ def refit(
     profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     afresh: bool = False,
+    once: bool = False,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other parameters of the same model, to the same data, starting from a previous fit.
@@ -512,6 +513,8 @@ def refit(
         Maximum number of steps; a model that only has to be ruled out need not converge.
     afresh : bool
         Whether release, deviations and noise start from the tracks alone instead of the previous fit.
+    once : bool
+        Whether a fit that is poor is left so, not tried with trials that are alike: others are known to be better.
     watch : callable, optional
         Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
@@ -563,7 +566,7 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
-    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch}
+    how: dict[str, Any] = {"most_iterations": most_iterations, "once": once, "watch": watch}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             solution = solve_from(predictor, theta, fixed_terms, **how)

@@ -253,7 +253,9 @@ def solve(
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
-        far_off = predicted_decrease > far_decrease
+        # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
+        # 9: steps at most in which a fit counts as far off (chosen)
+        far_off = predicted_decrease > far_decrease and iteration <= 9
         state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
         if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
             break  # They have taken up what the model lacks.
@@ -318,13 +320,11 @@ def update_variances(
     *,
     far_off: bool = False,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations; of a fit that is far off not the correlation of the noise,
-    which would take up the misfit.
-    """
+    """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
     if fixed_terms.noise is None:
         rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if any(estimable_sd):
+    if any(estimable_sd) and not far_off:
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
         state = replace(state, spread=spread)
     return state

@@ -44,7 +44,6 @@ from vinetrack.inference.marginal_likelihood import (
     with_diagonal,
 )
 from vinetrack.inference.optimiser import (
-    MOST_ITERATIONS,
     FixedTerms,
     Solution,
     Watch,
@@ -136,37 +135,42 @@ def _solve_or_alike(
     state: FitState,
     fixed_terms: FixedTerms,
     *,
-    noise: tuple[float, Floats] | None = None,
-    most_iterations: int = MOST_ITERATIONS,
-    watch: Watch | None = None,
+    once: bool = False,
+    **how: Any,
 ) -> Solution:
-    """Solve; from bad starting values first with trials that are alike, and with the `noise` where it is known:
-    differences between trials in pressure and B would take up what the model can explain, and n is meaningless then.
-    Where they do all the same, the fit with trials that are alike stands.
+    """Solve, and where the fit is poor, unless it is to be tried `once`, with trials that are alike: differences
+    between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials may differ
+    again, if that leads near the tracks.
     """
-    # 1.5: χ² per point below which starting values are good (chosen)
-    if fixed_terms.spread is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points)):
-        return solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations, watch=watch)
-    how: dict[str, Any] = {"most_iterations": most_iterations, "least_decrease": 1.0, "watch": watch}
-    alike = solve(predictor, problem, state, FixedTerms(ALIKE, noise or fixed_terms.noise), **how)
-    # 4: steps that are left to trials that differ, at least (chosen)
-    state, left = replace(alike.state, spread=state.spread), max(most_iterations - alike.iterations, 4)
-    solution = solve(predictor, problem, state, fixed_terms, most_iterations=left, watch=watch)
-    return alike if is_poor_fit(predictor, solution) else solution
+    solution = solve(predictor, problem, state, fixed_terms, **how)
+    if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
+        return solution
+    try:
+        alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
+        solution = solve(predictor, problem, alike.state, fixed_terms, **how)
+        return alike if is_poor_fit(predictor, solution) else solution
+    except SimulationError:
+        return solution
 
 
 def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `_solve_or_alike`. Shapes: theta (n_free,).
+    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, and with
+    trials that are alike: noise and differences between trials would take up what the model can explain. Shapes: theta
+    (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
     state = replace(before.state, theta=theta)
-    noise = state.rho, state.variance
-    return _solve_or_alike(predictor, problem, state, fixed_terms, noise=noise, **how)
+    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
+    if fixed_terms.noise is None and cost(predictor, problem, state) >= 1.5 * float(np.sum(problem.points)):
+        noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
+        # 40: steps at fixed noise, at most (chosen)
+        state = replace(solve(predictor, problem, state, noise, most_iterations=40).state, spread=state.spread)
+    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
 
 
 # ------------------------------------------------------------------------------
