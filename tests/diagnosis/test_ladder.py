@@ -59,7 +59,7 @@ def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits
     assert table["floor_m"].tolist() == [in_sample(fits[1]).floor_m] * 2
     before, after = (table.iloc[k] for k in range(2))
     for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
-        assert before[column] > 1.3 * after[column]
+        assert before[column] > 1.25 * after[column]
     # The model that the vines were grown with, no number of it fitted.
     truth = fits[1].model.with_values(damping_values([trial for trial, _ in pairs]) | {f"{DEPLETION}.gamma": 1.4})
     held = ["eversion_damping.B", "eversion_damping.n", f"{DEPLETION}.gamma", "P_y"]

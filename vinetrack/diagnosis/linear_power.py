@@ -158,9 +158,8 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     only: str = "",
 ) -> Power:
-    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect. Of planned trials,
-    whose noise is stated, at finite sizes; every diagnosis computes that of measured ones, by linear theory.
-    """
+    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
+    # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
     start = None if tests.fit.options["held"].noise is None else noiseless_start(tests.fit)
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
     normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
