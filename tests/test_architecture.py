@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 34),
-    "inference": (5645, 14, 51),
+    "inference": (5646, 14, 51),
     "interface": (599, 2, 2),
     "kinematics": (1665, 6, 12),
     "laboratory": (1600, 6, 9),
