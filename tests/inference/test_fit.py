@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -18,10 +19,11 @@ from vinetrack.diagnosis import misfit_tests as hypotheses
 from vinetrack.diagnosis.ladder import candidates_of, first_that_counts
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference import solving
+from vinetrack.inference import optimiser, solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products, whiten
+from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
@@ -346,14 +348,27 @@ def test_the_yield_pressure_is_estimated_instead_of_a_release():
         assert 0.1 < begins < 0.25
 
 
+def test_a_step_that_is_short_by_its_damping_alone_is_no_convergence(campaign, monkeypatch):
+    solution, predictor = campaign[0].solution, campaign[0].predictor
+    target = solution.state.theta
+
+    def damped(*given: Any) -> tuple[FitState, float]:
+        return replace(given[3], theta=given[3].theta + 0.05 * (target - given[3].theta)), 1e9
+
+    monkeypatch.setattr(optimiser, "_accepted_step", damped)
+    held = FixedTerms(solution.state.spread, (solution.state.rho, solution.state.variance))
+    elsewhere = replace(solution.state, theta=target + 1e-4)
+    found = solve(predictor, solution.problem, elsewhere, held, most_iterations=4)
+    assert (found.converged, found.iterations) == (False, 4)
+
+
 def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch):
-    whole, reached = Predictor.linearise, list[Floats]()
+    whole, calls = Predictor.linearise, []
 
     def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
-        if not trial_effects_only and len(reached) > 2 and not np.array_equal(theta, reached[-1]):
+        calls.append(trial_effects_only)
+        if not trial_effects_only and calls.count(False) > 2:
             raise SimulationError("Trial slow0: the model could not be integrated beyond 0.3 s.")
-        if not trial_effects_only:
-            reached.append(theta)
         return whole(self, theta, own, trial_effects_only=trial_effects_only)
 
     monkeypatch.setattr(Predictor, "linearise", breaks_later)
@@ -382,9 +397,8 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
     assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
     for one, other in zip(warm.numbers, cold.numbers, strict=True):
         assert one.name == other.name
-        # Two maxima of the scatter of pressure and B lie within 0.2 of −2 ln L of each other.
-        assert abs(one.value - other.value) < 0.2 * other.sigma
-        assert one.sigma == pytest.approx(other.sigma, rel=0.1)
+        assert abs(one.value - other.value) < 0.1 * other.sigma
+        assert one.sigma == pytest.approx(other.sigma, rel=0.05)
     # The parameters of a vine that is left out are dropped.
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
