@@ -27,7 +27,7 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
 from vinetrack.diagnosis.diagnose import not_better, with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
-from vinetrack.diagnosis.ladder import align_trials
+from vinetrack.diagnosis.ladder import align_trials, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
@@ -439,6 +439,9 @@ def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain):
         assert not np.shares_memory(getattr(diagnosis.fits[0].predictor, name), array)
         np.testing.assert_array_equal(array, kept[name])
     np.testing.assert_array_equal(plain.solution.state.theta, theta)
+    # Otherwise fits without a condition, which end early, miss by more or less after a run than after `diagnose`.
+    assert plain.predictor.is_central
+    assert with_host(plain, None).predictor.is_central
 
 
 DRAG = 0.5

@@ -66,10 +66,7 @@ def candidates_of(
 def with_host(fit: Fit, host: Model | None) -> Fit:
     """Return a fit whose trajectories are simulated by the compiled form of a larger model."""
     predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
-    # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
-    predictor.steps = fit.predictor.steps.copy()
-    predictor.pressure_step = fit.predictor.pressure_step.copy()
-    return replace(fit, predictor=predictor)
+    return replace(fit, predictor=predictor.with_steps_of(fit.predictor))
 
 
 def initial_fit(

@@ -287,8 +287,7 @@ def with_curves(fit: Fit) -> Fit:
     if fit.trials:
         return fit
     former, state = fit.predictor, fit.solution.state
-    predictor = Predictor(former.layout, former.data, former.host)
-    predictor.steps, predictor.pressure_step = former.steps.copy(), former.pressure_step.copy()
+    predictor = Predictor(former.layout, former.data, former.host).with_steps_of(former)
     columns = predictor.linearise(state.theta, state.trial_effects)
     # Cross products stay those of the fit, whose columns were computed with other steps.
     solution = replace(fit.solution, columns=tuple(columns))

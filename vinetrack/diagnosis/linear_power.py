@@ -119,8 +119,7 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     data = list(map(_as_moved, before.data, moved, state.trial_effects[:, ORIGIN]))
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
-    predictor = Predictor(before.layout, data, before.host)
-    predictor.steps, predictor.pressure_step = before.steps.copy(), before.pressure_step.copy()
+    predictor = Predictor(before.layout, data, before.host).with_steps_of(before)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
     how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2}

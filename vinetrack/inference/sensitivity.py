@@ -219,6 +219,15 @@ class Predictor:
         self.steps = np.full(len(layout.keys), 1e-3)
         self.is_central = False  # whether differences are central, of twice as many simulations
 
+    def with_steps_of(self, other: Predictor) -> Predictor:
+        """The predictor with the finite differences to which another one of the same parameters has adapted."""
+        self.steps, self.pressure_step, self.is_central = (
+            other.steps.copy(),
+            other.pressure_step.copy(),
+            other.is_central,
+        )
+        return self
+
     def run(self, jobs: Jobs, times_s: Sequence[Floats] | None = None, model: Model | None = None) -> list[Trajectory]:
         """Simulate at the times of each job's trial, or at `times_s`, by the model of the fit or another one."""
         return self._simulated(jobs, times_s, model).trajectories()
