@@ -96,6 +96,7 @@ def ladder(*added: str) -> pd.DataFrame:
             "expected_low_m": 1.2e-3,
             "expected_high_m": 2.2e-3,
             "excess_left_out_m": 5e-3 / 5**i,
+            "partial": False,
         }
         for i, name in enumerate(added)
     ]

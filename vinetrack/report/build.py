@@ -13,7 +13,6 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
@@ -151,13 +150,6 @@ class ReportTable:
         return bool(self.rows)
 
 
-def data_uri(name: str, text: str) -> str:
-    """Return a file as a data URI."""
-    kind = "application/json" if name.endswith(".json") else "text/csv"
-    escaped = quote(text, safe=",;:!*'()/ -._~+@=$?")  # the characters that need no escaping
-    return f"data:{kind};charset=utf-8,{escaped}"
-
-
 # ------------------------------------------------------------------------------
 # The section of the report on the diagnosis: candidates, upper limits, tied candidates, the next trial, drift.
 
@@ -194,29 +186,14 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "sentence": verdict_sentence(diagnosis),
         "summaries": [effects[name].summary for name in named if name in effects],
         "table": verdict_table(diagnosis),
-        "explanation": diagnosis.explanation,
-        "ladder": ladder_rows(diagnosis.ladder),
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
-        "force": missing_force(diagnosis.missing_force),
         "rounds": rounds,
         "hidden": hidden,
         "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes, "columns": columns},
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
-        "notes": list(diagnosis.notes),
     }
-
-
-def ladder_rows(ladder: pd.DataFrame | None) -> list[tuple[str, ...]]:
-    """Return the errors of every model of `ladder.csv`, mm."""
-    keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
-    shown = []
-    for row in [] if ladder is None else ladder.to_dict("records"):
-        mark = " (partial)" if row.get("partial") else ""
-        step = f"+ {listed_names(row['added'].split('+'))}{mark}" if row["added"] else "initial model"
-        shown.append((step, *(number(1e3 * float(row[key])) for key in keys)))
-    return shown
 
 
 def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
@@ -293,31 +270,6 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "trials": ReportTable("", head, rows if head else (), frozenset(range(len(head)))),
         "separations": separations,
         "calibration": str(content.get("calibration") or ""),
-    }
-
-
-def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: sentences, and rows of weights and simple laws; None for none."""
-    if not content:
-        return None
-    rows = [
-        (
-            str(law.get("words") or law.get("law") or ""),
-            f"{100 * float(law['explained']):.0f} %" if is_finite(law.get("explained")) else "–",
-            with_error(law.get("amplitude_N"), law.get("sigma_N")),
-        )
-        for law in content.get("laws") or []
-    ]
-    learned = content.get("learned") or {}
-    weights = [
-        (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
-        for name, weight in (learned.get("weights") or {}).items()
-    ]
-    return {
-        "sentence": str(content.get("sentence") or content.get("text") or ""),
-        "laws": rows,
-        "learned": str(learned.get("sentence") or ""),
-        "weights": weights,
     }
 
 
@@ -583,7 +535,7 @@ def build_report(content: dict[str, Any]) -> str:
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
     in_templates = (rows, bounds_text, listed_names, expected_text, model_errors)
-    environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
+    environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
     figures = {part: [one for section, one in drawn if section == part] for part in sections.values()}
