@@ -63,9 +63,8 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         ax.axhline(middle, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
     ax.margins(y=0.15)
     st.plain_log_ticks(ax, "y")
-    partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
-    for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
+    for added, part in list(zip(ladder["added"], ladder["partial"], strict=True))[1:]:
         words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part else "")
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)

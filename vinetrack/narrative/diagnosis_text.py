@@ -278,7 +278,7 @@ def _ranking(step: Round) -> list[str]:
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     body = []
     for row in ladder.to_dict("records"):
-        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") else "")
+        model = (str(row["added"]) or "initial model") + ", partial" * row["partial"]
         errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
         cells = (f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)
         body.append((model, *cells, expected_text(*(row[name] for name in EXPECTED)) or "–"))

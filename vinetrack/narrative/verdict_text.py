@@ -183,10 +183,12 @@ def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _errors(ladder: pd.DataFrame | None) -> str:
-    """The error of position before and after, on conditions left out where there are such."""
-    ladder = None if ladder is None else settled_rows(ladder)
-    if ladder is None or not len(ladder):
+    """The error of position before and after, on conditions left out where there are such. Partial steps, which reduce
+    an unexplained misfit without removing it, do not count.
+    """
+    if ladder is None:
         return ""
+    ladder = ladder[~ladder["partial"]]
     first, last = ladder.iloc[0], ladder.iloc[-1]
     key, what = "rms_left_out_m", "error on conditions left out"
     if not math.isfinite(float(first[key])):
@@ -200,11 +202,6 @@ def expected_text(error_m: float, low_m: float, high_m: float) -> str:
     """Error that an adequate model would show, with its 95 % range, mm; blank where it is not known."""
     middle, low, high = (number(1e3 * end_m) for end_m in (error_m, low_m, high_m))
     return f"{middle} mm ({low} to {high})" if math.isfinite(error_m) else ""
-
-
-def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
-    return table[~table["partial"].astype(bool)] if "partial" in table else table
 
 
 def _settled(diagnosis: Diagnosis) -> tuple[Sequence[Number], str]:
@@ -300,7 +297,7 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         if diagnosis.not_tried:
             return f"fill in what {listed_names(diagnosis.not_tried)} need in the sheet: they were not tried", ""
         table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
-        if table is not None and "partial" in table and (near := list(table["added"][table["partial"].astype(bool)])):
+        if table is not None and (near := list(table["added"][table["partial"]])):
             return f"see what `vinetrack add {near[0]} RESULTS`, a part, leaves; then run `vinetrack propose`", told
         return "look at the figures of the missing force, and run `vinetrack propose`", told
     if diagnosis.next_experiment:
