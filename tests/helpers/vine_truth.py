@@ -1,69 +1,31 @@
-"""Truth for the tests of `motion`: everting vines integrated by SciPy, and noise of known statistics.
-
-m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x, integrated to 1e-10: none of the package's own
-integrators or effects take part.
+"""Truth for the tests of `motion`: the vines of `by_hand`, followed by SciPy, as recordings with noise of known
+statistics.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from by_hand import followed
+from by_hand import N, Vine, followed
 from scipy.signal import lfilter
 
 from vinetrack.core.records import Floats, Track, plain_track
 
-G = 9.81
-N_EXPONENT = 0.37
 B_PRINTED = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
 CAPTURE_FPS = 1069.0
 
 
-@dataclass(frozen=True)
-class Vine:
-    """One trial from rest: tail position and speed at any time after release, and the quasi-steady tail speed."""
-
-    scale: int
-    tail_speed_m_s: float
-    payload_kg: float = 0.0
-
-    @property
-    def diameter_m(self) -> float:
-        return 0.006 * self.scale
-
-    @property
-    def length_m(self) -> float:
-        return 0.070 * self.scale
-
-    @property
-    def linear_density_kg_m(self) -> float:
-        return 1200 * math.pi * self.diameter_m * 50e-6 * self.scale
-
-    @property
-    def drive_N(self) -> float:
-        """(P − P_y)A that holds a weightless tail at `tail_speed_m_s`."""
-        return B_PRINTED[self.scale] * self.tail_speed_m_s**N_EXPONENT
-
-    def mass_kg(self, tail_position_m: Floats | float) -> Floats:
-        c = self.linear_density_kg_m / 2
-        return self.linear_density_kg_m * self.length_m + self.payload_kg - c * np.asarray(tail_position_m)
-
-    def quasi_steady_speed(self, tail_position_m: Floats) -> Floats:
-        """Tail speed at which all forces balance at this position: B ẋⁿ = (P − P_y)A + 2 m g."""
-        force = self.drive_N + 2 * self.mass_kg(tail_position_m) * G
-        return (force / B_PRINTED[self.scale]) ** (1 / N_EXPONENT)
+def scaled(scale: int, tail_speed_m_s: float, payload: float = 0.0) -> Vine:
+    """A vine of the paper's scales, at a pressure whose (P − P_y)A holds a weightless tail at this speed."""
+    vine = Vine(0.006 * scale, 50e-6 * scale, 0.070 * scale, 3e3, 3e3, B_PRINTED[scale], payload)
+    return replace(vine, P=vine.P_y + vine.B * tail_speed_m_s**N / vine.A)
 
 
 @lru_cache(maxsize=512)
 def motion(vine: Vine):
     """Dense solution (x, ẋ)(t) of one vine from rest, and the time at which it is fully grown (99.9 % of L)."""
-    b = B_PRINTED[vine.scale]
-
-    def acceleration(_t: float, x: float, v: float) -> float:
-        return (0.5 * vine.drive_N - 0.5 * b * v**N_EXPONENT) / float(vine.mass_kg(x)) + G
-
-    travel = followed(acceleration, 2 * 0.999 * vine.length_m, until=40 * vine.length_m / vine.tail_speed_m_s)
+    travel = followed(lambda _t, x, v: vine.base(x, v) / vine.m(x), 2 * 0.999 * vine.L)
     return travel.state, travel.end
 
 

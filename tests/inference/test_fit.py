@@ -11,7 +11,7 @@ from grown import grown, pairs_of
 from hidden_truth import grown as hidden
 from hidden_truth import sheet
 from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, as_track, filmed, grown_position, small_campaign, vine_trial
-from vine_truth import Vine, record
+from vine_truth import record, scaled
 
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
@@ -496,8 +496,8 @@ def test_origins_of_rounded_tracks_have_the_stated_errors():
 
 def test_trials_are_weighted_where_noise_grows_with_speed():
     """Sixteen fast vines filmed with 0.06 mm of noise and a blur of as many µs."""
-    pairs, true_sd, vine = [], [], Vine(2, 10.0)
-    known = {"diameter_m": vine.diameter_m, "thickness_m": 1e-4, "pressure_Pa": 3e4, "yield_pressure_Pa": 1e3}
+    pairs, true_sd, vine = [], [], scaled(2, 10.0)
+    known = {"diameter_m": vine.D, "thickness_m": 1e-4, "pressure_Pa": 3e4, "yield_pressure_Pa": 1e3}
     for i in range(16):
         draw = np.random.default_rng(20100 + i)
         made = record(vine, draw, noise_m=6e-5)

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from vine_truth import B_PRINTED, CAPTURE_FPS, N_EXPONENT, G, Recording, Vine, ar1, motion, record
+from by_hand import G, N, Vine
+from vine_truth import CAPTURE_FPS, Recording, ar1, motion, record, scaled
 
 from vinetrack import effects
 from vinetrack.core.records import Kinematics, Track, Trial, plain_track
@@ -104,8 +105,8 @@ def release_of(track: Track, travel_ratio: float = 2.0) -> Release:
 
 
 FOUND_WITHIN = [
-    (Vine(1, 3.0), 3e-5, 0.5), (Vine(1, 10.0), 1e-4, 0.5), (Vine(3, 5.0), 1e-4, 1.0),
-    (Vine(4, 10.0), 1e-4, 1.0), (Vine(4, 1.0), 1e-4, 2.0), (Vine(4, 0.3), 3e-5, 2.0),
+    (scaled(1, 3.0), 3e-5, 0.5), (scaled(1, 10.0), 1e-4, 0.5), (scaled(3, 5.0), 1e-4, 1.0),
+    (scaled(4, 10.0), 1e-4, 1.0), (scaled(4, 1.0), 1e-4, 2.0), (scaled(4, 0.3), 3e-5, 2.0),
 ]  # fmt: skip
 
 
@@ -125,7 +126,7 @@ def test_onset_is_found_to_within_frames(vine, noise_m, frames):
 def test_origin_is_within_its_error():
     pulls = []
     for seed in range(1000, 1060):
-        trial = record(Vine(2, 2.0), np.random.default_rng(seed), noise_m=1e-4, rho=0.5, rest_frames=60)
+        trial = record(scaled(2, 2.0), np.random.default_rng(seed), noise_m=1e-4, rho=0.5, rest_frames=60)
         release = release_of(trial.track)
         pulls.append((release.lead_position_m - trial.lead_position_m[0]) / release.lead_position_sigma_m)
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.6
@@ -145,17 +146,13 @@ def test_motion_from_the_first_frame_is_said_and_a_start_just_missed_is_extrapol
     assert abs(release.lead_position_m) < 3e-4
 
 
-SLOW = Vine(4, 1.5)
+SLOW = scaled(4, 1.5)
 
 
 def summarise(vine: Vine, **changes: object) -> tuple[Recording, dict, dict]:
     """A recording of a vine, its row and its point."""
-    pressure_Pa = vine.drive_N / (math.pi * vine.diameter_m**2 / 4) + 3e3
-    trial = Trial(
-        name="t", vine="v", condition="c", diameter_m=vine.diameter_m, thickness_m=50e-6 * vine.scale,
-        length_m=vine.length_m, pressure_Pa=pressure_Pa, pressure_sigma_Pa=100.0, yield_pressure_Pa=3e3,
-        yield_pressure_sigma_Pa=200.0, payload_kg=vine.payload_kg,
-    )  # fmt: skip
+    known = {"condition": "c", "growth_angle_rad": 0.0, "pressure_sigma_Pa": 100.0, "yield_pressure_sigma_Pa": 200.0}
+    trial = vine.trial(chamber_m3=math.nan, inlet_m=math.nan, **known)
     recording = record(vine, np.random.default_rng(5), noise_m=5e-5)
     result = summary.summarise_trial(replace(trial, **changes), recording.track, RunSettings(), base_model())
     return recording, result.row, result.point
@@ -167,20 +164,20 @@ def test_a_steady_trial_gives_its_speeds_and_the_force_that_holds_it():
     assert row["steady_rule"] == "gated"
     x_ss, sigma, force = row["x_ss_m_s"], row["x_ss_sigma_m_s"], row["force_N"]
     assert 0 < sigma < 0.02 * x_ss
-    assert B_PRINTED[4] * x_ss**N_EXPONENT == pytest.approx(force, rel=5e-3)
-    assert force > SLOW.drive_N
+    assert SLOW.B * x_ss**N == pytest.approx(force, rel=5e-3)
+    assert force > (SLOW.P - SLOW.P_y) * SLOW.A
     assert row["x_ss_paper_m_s"] == pytest.approx(x_ss, rel=0.1)
     solution, grown_s = motion(SLOW)
     middle_s = 0.5 * (row["steady_from_s"] + row["steady_to_s"])
     assert x_ss == pytest.approx(solution(middle_s - recording.release_s)[1], rel=0.02)
     x, v = solution(np.linspace(0, grown_s, 20_001))
-    truth = np.interp(0.95 * 2 * SLOW.length_m, x, v) / 2
+    truth = np.interp(0.95 * 2 * SLOW.L, x, v) / 2
     assert row["final_lead_velocity_m_s"] == pytest.approx(truth, rel=0.03)
 
 
 def test_a_trial_that_still_gathers_speed_or_whose_window_is_outside_the_recording_says_why():
     outside = {"steady_window_s": (900.0, 901.0)}
-    for vine, changes, status in ((Vine(4, 30.0, payload_kg=0.0356), {}, "ok"), (SLOW, outside, "warning")):
+    for vine, changes, status in ((scaled(4, 30.0, payload=0.0356), {}, "ok"), (SLOW, outside, "warning")):
         _, row, point = summarise(vine, **changes)
         assert (row["steady_rule"], row["status"], point["used"]) == ("", status, False)
         assert math.isnan(row["x_ss_m_s"])

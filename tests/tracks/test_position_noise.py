@@ -9,7 +9,7 @@ from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter, savgol_filter
-from vine_truth import CAPTURE_FPS, Vine, ar1, record
+from vine_truth import CAPTURE_FPS, ar1, record, scaled
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track, with_flag
@@ -37,7 +37,7 @@ def test_still_frames_and_motion_give_deviation_and_correlation(rho):
         assert correlation == pytest.approx(rho, abs=tolerance)
 
 
-@pytest.mark.parametrize("vine", [Vine(1, 0.2), Vine(1, 10.0), Vine(4, 10.0)], ids=str)
+@pytest.mark.parametrize("vine", [scaled(1, 0.2), scaled(1, 10.0), scaled(4, 10.0)], ids=str)
 def test_release_does_not_pass_for_noise(vine):
     found = []
     for seed in range(1000, 1030):
@@ -89,7 +89,7 @@ def experiment(blur_s: float, rho: float = 0.0, seed: int = 20000) -> tuple[Arra
     times, positions, true_sd = [], [], []
     for i in range(8):
         draw = np.random.default_rng(seed + i)
-        made = record(Vine(2, 10.0), draw, noise_m=NOISE_M, rho=rho)
+        made = record(scaled(2, 10.0), draw, noise_m=NOISE_M, rho=rho)
         blurred = blur_s * made.lead_velocity_m_s
         times.append(made.track.time_s)
         positions.append(made.track.lead_position_m + blurred * draw.standard_normal(blurred.size))
@@ -135,7 +135,12 @@ FRAME_S = 1 / CAPTURE_FPS
 
 
 def recorded(seed: int, end_frames: int = 0) -> list[Track]:
-    vines = [(Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.6), (Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0)]
+    vines = [
+        (scaled(1, 1.0), 3e-5, 0.0),
+        (scaled(2, 5.0), 1e-4, 0.6),
+        (scaled(3, 10.0), 1e-4, 0.6),
+        (scaled(4, 3.0), 1e-4, 0),
+    ]
     return [
         record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho, end_frames=end_frames).track
         for vine, noise_m, rho in vines
@@ -266,8 +271,8 @@ def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
 
 
 CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
-    *((Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.0), (Vine(2, 5.0), 1e-4, 0.6)),
-    *((Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0.0), (Vine(4, 10.0), 3e-4, 0.3)),
+    *((scaled(1, 1.0), 3e-5, 0.0), (scaled(2, 5.0), 1e-4, 0.0), (scaled(2, 5.0), 1e-4, 0.6)),
+    *((scaled(3, 10.0), 1e-4, 0.6), (scaled(4, 3.0), 1e-4, 0.0), (scaled(4, 10.0), 3e-4, 0.3)),
 ]
 
 
@@ -365,7 +370,7 @@ def test_nothing_is_found_in_clean_trials(noise_m, rho):
         for seed in range(1000, 1020):
             rng = np.random.default_rng(seed)
             rest, end = int(rng.integers(0, 80)), int(rng.integers(0, 2)) * 30
-            vine = Vine(scale, speed)
+            vine = scaled(scale, speed)
             trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=rest, end_frames=end)
             alarms += correct_frames(trial.track).notes
     assert alarms == []
@@ -378,7 +383,7 @@ def test_outliers_of_heavy_tails_change_no_times(rho):
     moved = 0
     for seed in range(1000, 1150):
         rng = np.random.default_rng(seed)
-        trial = record(Vine(4, 2.0), rng, noise_m=1e-9, rho=0.0, rest_frames=int(rng.integers(0, 60)))
+        trial = record(scaled(4, 2.0), rng, noise_m=1e-9, rho=0.0, rest_frames=int(rng.integers(0, 60)))
         kicks = rng.standard_t(3, trial.track.time_s.size) / np.sqrt(3)
         wild = lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], kicks)
         track = replace(trial.track, lead_position_m=trial.track.lead_position_m + 1e-4 * wild)
