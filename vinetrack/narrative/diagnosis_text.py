@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.diagnosis.result import EffectPower, FurtherTrials, Power
     from vinetrack.inference.fit_result import Fit
-    from vinetrack.planning.predictive_inputs import Band
 
 
 # ------------------------------------------------------------------------------
@@ -184,12 +183,10 @@ METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on bo
 
 LAW_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}  # Rows of the tables of n and B
 
-PREFERRED = "both_axes"  # The fit whose numbers head the report
-
 
 def damping_headline(damping: Mapping[str, Any]) -> str:
-    """Return the main result in one sentence."""
-    fit = damping.get(PREFERRED) or {}
+    """Return the main result in one sentence: that of the fit with errors on both axes."""
+    fit = damping.get("both_axes") or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
         return f"No damping law: {(fit.get('refused') or 'no trial gave a steady speed').removesuffix('.')}."
     first, *others = fit["vines"].values()
@@ -444,8 +441,11 @@ def volume_text(volume_m3: float) -> str:
     return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
 
 
-def trial_text(trial: Trial) -> str:
-    """Describe a trial in one line."""
+def trial_text(trial: Trial, in_full: bool = True) -> str:
+    """Describe a trial in one line; if not in full by diameter, length and pressure."""
+    pressure = pressure_text(trial.pressure_Pa, trial.pressure_unit, 4)
+    if not in_full:
+        return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {pressure}"
     size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
     payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
     degrees = math.degrees(trial.growth_angle_rad)
@@ -453,23 +453,13 @@ def trial_text(trial: Trial) -> str:
     direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
     rig = "" if math.isnan(trial.chamber_m3) else f", chamber {volume_text(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
-    return f"{size} at {pressure_text(trial.pressure_Pa, trial.pressure_unit, 4)}, {payload}, growing {direction}{rig}"
-
-
-def _size_text(trial: Trial) -> str:
-    pressure = pressure_text(trial.pressure_Pa, trial.pressure_unit, 4)
-    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {pressure}"
+    return f"{size} at {pressure}, {payload}, growing {direction}{rig}"
 
 
 def value_in_unit(value: float, unit: str, pressure_unit: str = "kPa") -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
     factor = display_unit(unit, pressure_unit, units.PREDICTION_UNITS)[1]
     return "never" if math.isinf(value) else number(value * factor)
-
-
-def speed_band_text(share: Band) -> str:
-    """Return the 90 % band of the final speed with one uncertain input."""
-    return f"{number(share.low)} to {number(share.high)} m/s"
 
 
 def _changes(changes: Sequence[tuple[str, float, str]]) -> str:
@@ -516,9 +506,7 @@ def _implausible_text(symbol: str, value: float, unit: str, low: float, high: fl
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
-    "sweeps": lambda trial, swept_m3, in_full: (
-        f"{trial_text(trial) if in_full else _size_text(trial)}: it sweeps {volume_text(swept_m3)}"
-    ),
+    "sweeps": lambda trial, swept_m3, in_full: f"{trial_text(trial, in_full)}: it sweeps {volume_text(swept_m3)}",
     "supplied_chambers": lambda ms, volumes: (
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())

@@ -46,7 +46,7 @@ from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
+from vinetrack.narrative.diagnosis_text import trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning import prediction as vines
 from vinetrack.planning.predictive_inputs import (
@@ -196,7 +196,8 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     yield from table(map(_quantity_row, prediction.quantities), columns, align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
-    yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
+    shares = [(one.name, f"{number(one.low)} to {number(one.high)} m/s", str(one.why)) for one in prediction.shares]
+    yield from table(shares, head)
     # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
     changes = [
         (one.effect, one.size, f"{number(one.without_m_s)} → {number(one.final_m_s)} m/s", f"{one.change:+.1%}")

@@ -231,9 +231,6 @@ def upper_limits(
     return limits
 
 
-TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
-
-
 def tied_pairs(entry: Round) -> list[str]:
     """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
     names = list(map(spaced_name, entry.cosines.effects))
@@ -241,7 +238,7 @@ def tied_pairs(entry: Round) -> list[str]:
         (abs(value), f"{names[j]} and {names[i]} (cosine {number(value)})")
         for i, row in enumerate(entry.cosines.matrix)
         for j, value in enumerate(row[:i])
-        if is_finite(value) and abs(value) >= TIED_COSINE
+        if is_finite(value) and abs(value) >= 0.95  # above it two candidates count as tied (chosen)
     ]
     return [text for _, text in sorted(pairs, reverse=True)]
 
@@ -399,11 +396,6 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
     }
 
 
-def _csv(table: pd.DataFrame) -> str:
-    """A table as CSV, with five digits, more than the accuracy of any value."""
-    return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
-
-
 # ------------------------------------------------------------------------------
 # The section of the report that compares the model in use with the measurement.
 
@@ -489,7 +481,8 @@ def _figures(tables: FigureTables, figures: Iterable[RegisteredFigure]) -> list[
             if "." in name:
                 data = (tables.results.folder / name).read_text(encoding="utf-8")
             elif name:
-                name, data = f"{one.name}.csv", _csv(getattr(tables, name))
+                table, name = getattr(tables, name), f"{one.name}.csv"
+                data = table.to_csv(index=False, float_format="%.5g", lineterminator="\n")
             data = data if len(data) < 20_000 else ""  # as a page carries it (chosen); all else lies in the results
             shown.append(ReportFigure(one.name, one.title, one.caption, picture, name, data))
     return shown
