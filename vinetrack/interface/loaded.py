@@ -256,7 +256,7 @@ def _cells(name: str, part: pd.DataFrame, position: str) -> dict[str, str]:
 
 def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
     if position in ("x", "y"):
-        return flag_end_of_motion(trial, table_track(part.to_csv(index=False), trial))
+        return flag_end_of_motion(trial, table_track(part.to_csv(index=False), "", trial.capture_fps, trial.m_per_px))
     known = {name: part[name].to_numpy(dtype=float) for name in ERROR_COLUMNS if name in part}
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1

@@ -354,56 +354,48 @@ def design_reservoir(
     check_figure(figure)
     basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
     trial, loss, swept = basis.planned.trials[0], within_percent / 100, vines.swept_m3(basis.planned.trials[0])
+    inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
+    laws = [law.split(",")[0] for law in vines.GAMMAS]
+    speeds = [] if inputs is None else [f"speed, {law}" for law in laws]
+    lines = [
+        *basis.heading,
+        str(remark("sweeps", trial=trial, swept_m3=swept, in_full=inputs is not None)),
+        str(remark("keeps_pressure", percent=within_percent)),
+        "",
+    ]
+    rows, entries = [], []
     with waiting("simulating"):
-        inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
-        found = vines.chambers(trial, loss)
-        lost = {name: _losses(trial, volume_m3) for name, volume_m3 in found.items()}
-        lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, found, lost, at_fraction)]
+        for name, volume_m3 in vines.chambers(trial, loss).items():
+            lost, finals = _losses(trial, volume_m3), list[float]()
+            if inputs is not None:
+                finals = [vines.final_with(inputs, volume_m3, gamma, at_fraction) for gamma in vines.GAMMAS.values()]
+            cells = [f"{100 * share:.1f}" for share in lost.values()]
+            rows.append([name, volume_text(volume_m3), *cells, *(value_in_unit(final, "m/s") for final in finals)])
+            entries.append({"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": lost})
+        head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
+        lines += table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
+        if inputs is not None:
+            host = host_for(inputs.model)
+            (steady,) = vines.final_speeds(inputs.model, [inputs.trial], at_fraction, host=host).tolist()
+            place = 1.0 if trial.payload_kg > 0 else at_fraction
+            lines.append(str(remark("speeds_at_medians", y_over_L=place, m_s=steady)))
+        lines.append(str(remark("slow_and_fast")))
         if math.isfinite(supply_s) and inputs is not None:
-            volumes = {
-                law: vines.supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in vines.GAMMAS.items()
-            }
+            laws_and_gammas = vines.GAMMAS.items()
+            volumes = {law: vines.supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in laws_and_gammas}
             lines.append(str(remark("supplied_chambers", ms=1e3 * supply_s, volumes=volumes)))
-    if math.isfinite(supply_s) and inputs is None:
-        lines.append(f"! {remark('supply_needs_wall')}")
+        elif math.isfinite(supply_s):
+            lines.append(f"! {remark('supply_needs_wall')}")
     if figure is not None:
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
         write_figure(draw_reservoir(drawn_m3, _losses(trial, drawn_m3), loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
-    entries = [
-        {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": lost[name]}
-        for name, volume_m3 in found.items()
-    ]
     return lines, {"warnings": basis.heading, "chambers": entries}
 
 
 def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
     """Fraction of the gauge pressure that a chamber, or each of several, loses, by the gas law."""
     return {law: vines.gauge_loss(trial, volume_m3, gamma) for law, gamma in vines.GAMMAS.items()}
-
-
-def _reservoir_lines(
-    trial: Trial, inputs: PredictiveInputs | None, loss: float, found: Mapping[str, float],
-    lost: Mapping[str, Mapping[str, float]], at_fraction: float,
-) -> Iterator[str]:  # fmt: skip
-    yield str(remark("sweeps", trial=trial, swept_m3=vines.swept_m3(trial), in_full=inputs is not None))
-    yield str(remark("keeps_pressure", percent=100 * loss))
-    yield ""
-    laws = [law.split(",")[0] for law in vines.GAMMAS]
-    rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
-    for name, volume_m3 in found.items():
-        cells = [name, volume_text(volume_m3), *(f"{100 * share:.1f}" for share in lost[name].values())]
-        if inputs is not None:
-            finals = [vines.final_with(inputs, volume_m3, gamma, at_fraction) for gamma in vines.GAMMAS.values()]
-            cells += [value_in_unit(final, "m/s") for final in finals]
-        rows.append(cells)
-    head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
-    yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
-    if inputs is not None:
-        (steady,) = vines.final_speeds(inputs.model, [inputs.trial], at_fraction, host=host_for(inputs.model)).tolist()
-        place = 1.0 if trial.payload_kg > 0 else at_fraction
-        yield str(remark("speeds_at_medians", y_over_L=place, m_s=steady))
-    yield str(remark("slow_and_fast"))
 
 
 # ------------------------------------------------------------------------------

@@ -314,15 +314,11 @@ def _table(text: str) -> Table:
     raise InputError(f"has no columns of times and positions (found: {found_names[:120]})", remedy)
 
 
-def table_track(text: str, trial: Trial) -> Track:
-    """Read the track of a trial from a table of positions, as text."""
-    return _read_table(_table(text), trial.point_mass, trial.capture_fps, trial.m_per_px)
-
-
-def _read_table(table: Table, wanted: str, capture_fps: float, m_per_px: float) -> Track:
-    """Read the track of one point: that of the name `wanted`, else that with the most places. A blank coordinate, or
-    one that DeepLabCut finds unlikely, is a frame without a place.
+def table_track(text: str, wanted: str, capture_fps: float, m_per_px: float) -> Track:
+    """Read the track of one point of a table, given as text: that of the name `wanted`, else that with the most places.
+    A blank coordinate, or one that DeepLabCut finds unlikely, is a frame without a place.
     """
+    table = _table(text)
     known = [{name: "" if cell.lower() == "nan" else cell for name, cell in row.items()} for row in table.rows]
     table = replace(table, rows=tuple(known))
     columns: dict[str, dict[str, tuple[str, str]]] = {}  # by point and quantity, with their units
@@ -522,7 +518,7 @@ def read_track(
     text = read_text(path)
     if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
         return read_project(text, point_mass, frames_used)
-    track = _read_table(_table(text), point_mass, capture_fps, m_per_px)
+    track = table_track(text, point_mass, capture_fps, m_per_px)
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
