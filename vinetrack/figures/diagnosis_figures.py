@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Floats
 
 BEFORE, AFTER = st.VERMILLION, st.BLUE
-AHEAD, BEHIND = st.BLUE, st.VERMILLION  # Colours of a vine ahead of the model, and behind it
 
 # ------------------------------------------------------------------------------
 # Errors of the models of the ladder, and the condition with the largest error of the initial model, before and after.
@@ -164,15 +163,12 @@ def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(8)
 
 
-# Colour and line of the models in the figure of drifts
-_MODELS = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
-
-
 @figure("drift", "drift", "Parameters that change with a condition", data="drift")
 def draw_drift(drift: pd.DataFrame, added: str, pressure_unit: str = "kPa") -> Figure | None:
     """The best B in groups of trials, relative to the common law, against a condition on which it should not depend;
     bars are one standard error from the scatter of replicates. With a complete model all are 1.
     """
+    models = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
     known = drift[np.isfinite(drift["ratio"].astype(float))] if len(drift) else drift
     if not len(known):
         return None
@@ -186,7 +182,7 @@ def draw_drift(drift: pd.DataFrame, added: str, pressure_unit: str = "kPa") -> F
     for ax, (parameter, against) in zip(st.panel_grid(fig, len(panels), n_columns), panels, strict=True):
         groups = known[(known["parameter"] == parameter) & (known["against"] == against)]
         name, unit, factor = drift_condition(str(against), pressure_unit)
-        for model, (colour, line) in _MODELS.items():
+        for model, (colour, line) in models.items():
             of_model = groups[groups["model"] == model]
             for vine, of_vine in of_model.groupby("vine", sort=False):
                 ordered = of_vine.sort_values("level")
@@ -201,7 +197,7 @@ def draw_drift(drift: pd.DataFrame, added: str, pressure_unit: str = "kPa") -> F
     fig.supylabel("value / common law", fontsize=11)
     handles = [
         st.line_key(f"{model}: with {added}" if model == "after" and added else model, color=colour, marker="o", ms=5)
-        for model, (colour, _) in _MODELS.items()
+        for model, (colour, _) in models.items()
         if (known["model"] == model).any()
     ]
     handles += [st.line_key(vine, color=st.MUTED, marker=markers[vine], ls="none") for vine in vines]
@@ -236,7 +232,7 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
         y, misfit_mm = labels.index(row.condition_label), 1e3 * row.misfit_m
         left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
         # Cells become transparent with decreasing misfit, so that the page shows through.
-        depth, colour = min(abs(misfit_mm) / full_mm, 1.0), AHEAD if misfit_mm > 0 else BEHIND
+        depth, colour = min(abs(misfit_mm) / full_mm, 1.0), st.BLUE if misfit_mm > 0 else st.VERMILLION
         ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, facecolor=colour, alpha=0.85 * depth, lw=0))
         beyond = not abs(row.misfit_m) <= 2 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
         if numbered and beyond and depth > 0.06:
@@ -248,8 +244,8 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
     ax.set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
     words = f"full colour: {full_mm:.2g} mm{'; numbers in mm, where beyond scatter' if numbered else ''}"
     handles = [
-        st.patch_key("measured is ahead of the model", AHEAD, 0.85),
-        st.patch_key("measured is behind", BEHIND, 0.85),
+        st.patch_key("measured is ahead of the model", st.BLUE, 0.85),
+        st.patch_key("measured is behind", st.VERMILLION, 0.85),
         st.patch_key(words, st.MUTED, 0.2),
     ]
     if len(counts) > len(labels):
@@ -257,14 +253,6 @@ def draw_where(where: pd.DataFrame) -> Figure | None:
         handles.append(st.patch_key(words, "none"))
     st.page_legend(fig, handles, 2, handlelength=1.3)
     return fig
-
-
-# Quantities that the force may depend on besides the pressure: label, and factor from SI
-_FORCE_AXES = {
-    "lead_position_m": ("growth y (mm)", 1e3),
-    "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
-    "time_s": ("time since release (ms)", 1e3),
-}
 
 
 @figure("learned_force", "where", "Missing force, learned in the fit", data="learned_force")
@@ -279,7 +267,13 @@ def draw_learned_force(learned_force: pd.DataFrame, pressure_unit: str = "kPa") 
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
     unit, factor = display_unit("Pa", pressure_unit)
-    known = _FORCE_AXES | {"pressure_Pa": (f"pressure ({unit})", factor)}
+    # Quantities that the force may depend on: label, and factor from SI
+    known = {
+        "lead_position_m": ("growth y (mm)", 1e3),
+        "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
+        "time_s": ("time since release (ms)", 1e3),
+        "pressure_Pa": (f"pressure ({unit})", factor),
+    }
     axes = {name: axis for name, axis in known.items() if name in grid and grid[name].notna().any()}
     conditions = f"N = {along['condition'].nunique()} conditions"
     if len(axes) == 2:

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_PANELS = 60  # Chosen: in rows of eight they are 1.4 in wide, the narrowest that has room for its label
-
 
 # ------------------------------------------------------------------------------
 # One trial: position and speed against time, and the steady window of each rule.
@@ -165,7 +163,8 @@ def _model_panels(
     for every panel its axes, its trials from shortly before anything moves, the longest of them, and its colour.
     """
     known = comparison[comparison["condition"].isin(list(trajectories))]
-    farthest = known["rms_position_m"].fillna(0.0).sort_values(ascending=False, kind="stable").index[:_MOST_PANELS]
+    # 60: panels at most (chosen: in rows of eight they are 1.4 in wide, the narrowest that has room for its label)
+    farthest = known["rms_position_m"].fillna(0.0).sort_values(ascending=False, kind="stable").index[:60]
     shown = list(st.rows(known[known.index.isin(farthest)]))
     if not shown:
         return None, []

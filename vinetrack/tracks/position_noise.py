@@ -129,8 +129,6 @@ MOVING_STRETCH, MOVING_ORDER = 12, 3  # Points of a stretch in motion, and degre
 
 RHO_GRID = np.linspace(0.0, 0.95, 20)
 
-SHORTEST_MOTION = 12  # Points in motion below which the whole track is used (chosen)
-
 THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences of white noise of unit variance
 
 
@@ -176,12 +174,13 @@ def rounding_noise(position_m: Floats) -> float:
     floor_m = _rounding_step(position_m) / math.sqrt(12)
     if floor_m == 0:
         return 0.0
+    shortest = 12  # Points in motion below which the whole track is used (chosen)
     moving_m = position_m[_frames_at_rest(position_m) :]
-    moving_m = moving_m if moving_m.size >= SHORTEST_MOTION else position_m
+    moving_m = moving_m if moving_m.size >= shortest else position_m
     # Exact positions at one speed are multiples of their step too, but smooth: third differences are zero except a
     # few at a corner.
     uneven = np.count_nonzero(np.abs(np.diff(moving_m, 3)) > floor_m)
-    allowed = 5 if moving_m.size >= SHORTEST_MOTION else 0
+    allowed = 5 if moving_m.size >= shortest else 0
     return floor_m if uneven > max(allowed, 0.05 * moving_m.size) else 0.0
 
 
