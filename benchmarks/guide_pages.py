@@ -21,14 +21,16 @@ import sys
 import tempfile
 import textwrap
 import time
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
 import pandas as pd
-from commanded import Shown, printed, rewritten
+from commanded import INDENT, Shown, pieces, printed
 from grown import grown, sheet
+from own_effect import block
 
 from vinetrack.core.tables import write_csv, write_json
 
@@ -47,11 +49,16 @@ SEED, STIFFNESS_N_M = 41, 0.4
 GALLERY = (("null:white", 52001), ("inlet_loss", 40000), ("payload_mass", 40000), ("outsider:growing_friction", 40000))
 
 
-def block(page: str, language: str) -> str:
-    """The one block of code of a page in this language."""
-    found = re.findall(rf"^```{language}\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
-    assert len(found) == 1
-    return str(found[0])
+def rewritten(text: str, command: Callable[[Shown], str]) -> str:
+    """The page with every command's output as it is now."""
+    lines = []
+    for piece in pieces(text):
+        if isinstance(piece, str):
+            lines.append(piece)
+            continue
+        body = [f"{INDENT}{line}".rstrip() for line in command(piece).splitlines()]
+        lines += [*piece.lines, *body, ""]
+    return "\n".join(lines) + "\n"
 
 
 def stage_demonstration(results: Path, scratch: Path) -> None:
@@ -76,7 +83,7 @@ def stage_own_effect(folder: Path) -> None:
     """The experiment of docs/own_effect.md: trials grown with its effect, which the model in use does not have."""
     folder.mkdir()
     effect = folder / "spring_line.py"
-    effect.write_text(block("own_effect", "python"), encoding="utf-8")
+    effect.write_text(block("python"), encoding="utf-8")
     (folder / "experiment.yaml").write_text("effects: [spring_line.py]\n", encoding="utf-8")
     rows = []
     for one in grown(sheet(), SEED, values={"spring_line.k": STIFFNESS_N_M}, own=[effect]):

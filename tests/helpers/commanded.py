@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Callable, Container
+from collections.abc import Container
 from dataclasses import dataclass
 
 from click.testing import Result
@@ -76,15 +76,3 @@ def printed(shown: Shown, exits: Container[int] = (0,)) -> str:
     if done.exit_code not in exits:
         raise AssertionError(done.output)
     return re.sub(r"[ \t]+$", "", done.output, flags=re.MULTILINE).strip("\n")
-
-
-def rewritten(text: str, command: Callable[[Shown], str] = printed) -> str:
-    """The page with every command's output as it is now."""
-    lines = []
-    for piece in pieces(text):
-        if isinstance(piece, str):
-            lines.append(piece)
-            continue
-        body = [f"{INDENT}{line}".rstrip() for line in command(piece).splitlines()]
-        lines += [*piece.lines, *body, ""]
-    return "\n".join(lines) + "\n"
