@@ -315,8 +315,6 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
 
 log = logging.getLogger(__name__)
 
-CLEARLY_WORSE = 0.5  # Decrease in ln L (chosen)
-
 
 class Cancelled(Exception):  # noqa: N818 - nothing went wrong
     """The work of a job was cancelled."""
@@ -337,18 +335,12 @@ class Evaluated:
 
 
 def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:
-    """Fit the model in use, as the model stage of the workflow does. The likelihood to be reached is in `fit.json`: if
-    the first start reaches it, no others are tried.
-    """
-    model = sized_model(campaign, choice)
+    """Fit the model in use, as the model stage of the workflow does."""
+    model = replace(sized_model(campaign, choice), values={})
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
-    bare = replace(model, values={})
-    run_fit = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
-    result = run_fit()
-    if not result.log_likelihood > campaign.stored.log_likelihood - CLEARLY_WORSE:
-        result = run_fit()
-    return _evaluated(campaign, choice, result)
+    fitted = fit(model, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
+    return _evaluated(campaign, choice, fitted)
 
 
 @in_one_blas_thread
@@ -362,7 +354,7 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
     chosen = {key: value for effect in new for key, value in sized.values.items() if key.startswith(f"{effect.name}.")}
     result = refit(before, model, start=chosen, watch=watch)
     is_larger = set(before.model.names) <= set(model.names)
-    is_worse = is_larger and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
+    is_worse = is_larger and result.log_likelihood < before.log_likelihood - 0.5  # of ln L (chosen)
     if new and (is_worse or not result.converged):
         defaults: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
         other = refit(before, model, start=defaults, watch=watch)
