@@ -46,6 +46,13 @@ def test_release_does_not_pass_for_noise(vine):
     assert np.median(found) == pytest.approx(5e-5, rel=0.1)
 
 
+def test_an_oscillation_that_no_cubic_follows_does_not_pass_for_noise():
+    rows = np.arange(200)
+    y = 3.0 * rows / CAPTURE_FPS + 2e-4 * np.sin(2 * np.pi * rows / 18)
+    noisy = [y + ar1(200, 1e-5, 0.0, np.random.default_rng(seed)) for seed in range(1000, 1010)]
+    assert np.median([position_noise(rows / CAPTURE_FPS, one)[0] for one in noisy]) == pytest.approx(1e-5, rel=0.2)
+
+
 @pytest.mark.parametrize("speed_m_s", [0.05, 0.15, 0.4, 1.0])
 def test_rounding_to_whole_pixels_is_noise_even_at_rest(speed_m_s):
     pixel = 4e-4
