@@ -163,11 +163,12 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
     rounds, named = [], () if diagnosis.contradicted_columns else diagnosis.effects or diagnosis.answer_set
     for entry in diagnosis.rounds:
+        testable = [row for row in entry.ranking if row.status != NOT_TESTABLE]
+        # Those that were fitted, that cannot be excluded, or that reach 2 σ
+        ranking = [row for row in testable if row.in_answer_set or row.status == REFITTED or abs(row.sigma) >= 2.0]
         untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
-        ranking = ranking_rows(entry)
-        n_below = len(entry.ranking) - len(untestable) - len(ranking)
-        rounds.append({"ranking": ranking, "n_below": n_below, "blind": blind, "of": entry})
+        rounds.append({"ranking": ranking, "n_below": len(testable) - len(ranking), "blind": blind, "of": entry})
     sizes, power = [], diagnosis.power
     wary = [f"Detectable sizes were not computed: {power.wary}."] if power is not None and power.wary else []
     if power is not None and not power.wary:
@@ -194,23 +195,6 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
     }
-
-
-def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
-    """Return the candidates of a round that were fitted, that it cannot exclude, or that reach 2 σ."""
-    return [
-        (
-            ("● " if row.in_answer_set else "") + spaced_name(row.effect),
-            row.kind,
-            number(row.delta_chi2),
-            number(row.sigma, 2),
-            estimates_text(row) or "–",
-            "fitted" if row.status == REFITTED else "predicted",
-            "; ".join(part for part in ("" if row.plausible else "not plausible", str(row.reason)) if part),
-        )
-        for row in entry.ranking
-        if row.status != NOT_TESTABLE and (row.in_answer_set or row.status == REFITTED or abs(row.sigma) >= 2.0)
-    ]
 
 
 def upper_limits(
@@ -527,7 +511,7 @@ def build_report(content: dict[str, Any]) -> str:
     }
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
-    in_templates = (rows, bounds_text, listed_names, expected_text, model_errors)
+    in_templates = (rows, bounds_text, estimates_text, listed_names, spaced_name, expected_text, model_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
