@@ -318,6 +318,14 @@ def test_no_vine_of_a_fine_grid_is_faster():
     assert (choice.prediction.final.name, choice.prediction.final.y_over_L) == ("ejection speed of the payload", 1.0)
 
 
+def test_a_stated_burst_stress_is_the_one_that_warns():
+    """A film stated to hold 20 MPa does not burst at the 7.8 MPa guessed for others."""
+    limits = room(62, films_m=(50e-6,), burst_share=0.5, burst_stress_Pa=20e6)
+    (choice,) = prediction.fastest(limits, EXACT, samples=2)
+    assert choice.limits[0] == "burst"
+    assert {"bursts", "nearly_bursts"}.isdisjoint(one.code for one in choice.prediction.hazards)
+
+
 def test_at_the_burst_stress_acceleration_is_the_same_for_every_film():
     """P = 2tσ/D: force ½PA = ¼πσtD, mass λL = ρπDtL, so a = σ/(4ρL) whatever t and D; without damping speeds agree."""
     limits = room(1000, films_m=(50e-6, 200e-6), burst_share=0.5, growth_angle_deg=90)

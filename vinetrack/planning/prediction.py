@@ -122,6 +122,7 @@ class VinePrediction:
     arrives: float
     slack: float
     samples: int
+    burst_stress_Pa: float = BURST_STRESS_PA
 
     @property
     def final(self) -> Band:
@@ -143,10 +144,11 @@ class VinePrediction:
         warned_from = 0.05  # Fraction of draws above which a hazard is reported (chosen)
         inputs, trial = self.inputs, self.inputs.trial
         stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-        if stress > 0.9 * BURST_STRESS_PA:
-            highest = trial.pressure_Pa * BURST_STRESS_PA / stress, trial.pressure_unit
-            facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "highest": highest}
-            yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
+        burst_Pa = self.burst_stress_Pa
+        if stress > 0.9 * burst_Pa * (1 + 1e-9):
+            highest, guess = (trial.pressure_Pa * burst_Pa / stress, trial.pressure_unit), burst_Pa == BURST_STRESS_PA
+            facts = {"MPa": stress / 1e6, "burst_MPa": burst_Pa / 1e6, "highest": highest, "guess": guess}
+            yield remark("bursts" if stress > burst_Pa else "nearly_bursts", **facts)
         given = trial.pressure_Pa, *np.quantile(inputs.draw(2000, 1)[YIELD], BAND).tolist()
         if given[0] <= given[2]:
             shown = zip(("pressure", "low", "middle", "high"), given, strict=True)
@@ -394,7 +396,10 @@ def fastest(
     fastest_of_draw = np.argmax(drawn, axis=0)
     choices = [
         Choice(
-            prediction=predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
+            prediction=replace(
+                predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
+                burst_stress_Pa=room.burst_stress_Pa,
+            ),
             limits=_limits(room, inputs.trial),
             odds=float(np.mean(fastest_of_draw == k)),
             others=others,
