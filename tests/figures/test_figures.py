@@ -70,7 +70,8 @@ def scaling() -> dict:
         "p": 0.01,
     }
     family = {"along": "diameter_mm", "vines": [f"vine{i}" for i in range(4)], "sizes": sizes, "B": B}
-    family |= {"B_95": [[0.9 * b, 1.1 * b] for b in B], "power": power, "line": power | {"slope": 0.3}, "refused": None}
+    family |= {"B_95_total": [[0.9 * b, 1.1 * b] for b in B], "power": power, "line": power | {"slope": 0.3}}
+    family |= {"refused": None}
     return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
 
 

@@ -248,7 +248,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
 def families(sizes: dict[str, tuple[float, float, float]]) -> dict:
     """Families of vines of these B, diameters, mm, and walls, µm."""
     vines = {
-        name: {"B": B, "B_95": [0.9 * B, 1.1 * B], "diameter_mm": diameter_mm, "thickness_um": thickness_um}
+        name: {"B": B, "B_95_total": [0.9 * B, 1.1 * B], "diameter_mm": diameter_mm, "thickness_um": thickness_um}
         for name, (B, diameter_mm, thickness_um) in sizes.items()
     }
     return fit_scaling({"both_axes": {"vines": vines}})

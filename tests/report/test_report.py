@@ -21,6 +21,7 @@ from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.narrative.diagnosis_text import damping_headline
 from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build
@@ -62,6 +63,11 @@ def page(**changes: object) -> str:
     content |= {"name": "vines", "trials": trials("a"), "damping": damping("v")}
     content |= {"provenance": PROVENANCE, "figures": [], "sections": [], "notes": []}
     return build.build_report({**content, **changes})
+
+
+def test_the_intervals_of_the_law_that_are_told_include_the_errors_that_trials_share():
+    assert damping_headline(damping("v")).count("0.350 to 0.390") == 1
+    assert "1.80 to 2.20" in damping_headline(damping("v"))
 
 
 class Tags(HTMLParser):

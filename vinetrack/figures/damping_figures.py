@@ -54,7 +54,7 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     st.plain_log_ticks(ax)
     fit = fits["both_axes"]
     refused = fit.get("n") is None or fit.get("refused")
-    law = "" if refused else f"One exponent for all vines: n = {with_interval(fit['n'], fit.get('n_95'))}"
+    law = "" if refused else f"One exponent for all vines: n = {with_interval(fit['n'], fit.get('n_95_total'))}"
     ax.set_title(law or "Steady force and speed (no fit: see the report)")
     _law_legend(fig, drawable, fits, styles)
     return fig
@@ -143,7 +143,7 @@ def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
         families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
         ax.set(xscale="log", yscale="log", xlabel=_SIZES[families[0]["along"]][0], ylabel="B (N·(s/m)ⁿ)")
         for i, family in enumerate(families):
-            B, B_95 = (np.array(family[name], dtype=float) for name in ("B", "B_95"))
+            B, B_95 = (np.array(family[name], dtype=float) for name in ("B", "B_95_total"))
             bars = np.clip([B - B_95[:, 0], B_95[:, 1] - B], 0, None)
             _draw_family(ax, family["sizes"], B, bars, family, i, f"B with 95 % interval, N = {B.size} vines")
         sizes = sorted({size for family in families for size in family["sizes"]})
@@ -303,7 +303,7 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
             ax.plot(span, B * span**published.EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
             if fitted and law.get("n"):
                 ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
-        n = with_interval(law.get("n"), law.get("n_95"))
+        n = with_interval(law.get("n"), law.get("n_95_total"))
         ax.set_title(f"{title}\nn = {n}, printed {published.EXPONENT:g}", fontsize=10.5)
     axes[0].set_ylabel("growth force above yield (N)")
     for ax in axes:

@@ -340,7 +340,7 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     vines = damping["both_axes"]["vines"]
     table = pd.DataFrame(
         [{"vine": name, **law} for name, law in vines.items()],
-        columns=["vine", "diameter_mm", "thickness_um", "B", "B_95"],
+        columns=["vine", "diameter_mm", "thickness_um", "B", "B_95_total"],
     )
     table["wall_over_diameter"] = table["thickness_um"] / table["diameter_mm"]
     isometric = _families(table, "diameter_mm", {"wall_over_diameter": ISOMETRIC_WITHIN})
@@ -361,7 +361,7 @@ def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> l
             "vines": group["vine"].tolist(),
             "sizes": group[along].tolist(),
             "B": group["B"].tolist(),
-            "B_95": group["B_95"].tolist(),
+            "B_95_total": group["B_95_total"].tolist(),
             **_lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group)),
         }
         for group in _of_several_sizes(ordered, within, [along])

@@ -345,7 +345,7 @@ def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     import pandas as pd
 
     rows = [
-        (name, method, vine, law["n"], *law["n_95"], vine_law["B"], *vine_law["B_95"], vine_law["n_trials"])
+        (name, method, vine, law["n"], *law["n_95_total"], vine_law["B"], *vine_law["B_95_total"], vine_law["n_trials"])
         for name, methods in laws.items()
         for method, law in methods.items()
         for vine, vine_law in law["vines"].items()

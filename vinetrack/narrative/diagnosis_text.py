@@ -190,8 +190,8 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
         return f"No damping law: {(fit.get('refused') or 'no trial gave a steady speed').removesuffix('.')}."
     first, *others = fit["vines"].values()
-    n, count = with_interval(fit["n"], fit.get("n_95")), sum(law["n_trials"] for law in (first, *others))
-    B = with_interval(first["B"], first.get("B_95"))
+    n, count = with_interval(fit["n"], fit.get("n_95_total")), sum(law["n_trials"] for law in (first, *others))
+    B = with_interval(first["B"], first.get("B_95_total"))
     facts = {"n": n, "B": B, "count": count, "vines": len(fit["vines"])}
     return sentence("damping_law" if others else "damping_law_of_one", facts)
 
