@@ -314,7 +314,7 @@ def _forces(
         valued = replace(model, values=dict(zip(model.parameter_names, row, strict=True)))
         terms = evaluate(valued, trial, m.time_s, m.lead_position_m, m.lead_velocity_m_s)
         drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        tension_N = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
+        tension_N = np.where(np.abs(terms.tension_N) < 1e-6 * drive_N, 0.0, terms.tension_N)
         moving = (m.lead_position_m <= places_m[-1]) & (m.lead_velocity_m_s > 0)
         least_N = np.min(tension_N[moving]) if moving.any() else math.nan
         # 0.01: compression of the tail from which the model is in doubt, as a fraction of the drive ½PA (chosen)
