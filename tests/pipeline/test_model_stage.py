@@ -166,6 +166,16 @@ def test_a_sheet_without_recordings_says_what_was_guessed(folder):
     assert list(power.not_testable) == ["payload_drag"]
 
 
+def test_a_plan_names_every_frame_rate_and_the_yield_pressure_that_it_assumes(folder):
+    sheet = (
+        "trial,diameter_mm,thickness_um,length_mm,pressure_psi,capture_fps\na,24,200,200,4,1000\nb,24,200,200,5,4000\n"
+    )
+    (folder / "rates.csv").write_text(sheet)
+    told = {entry.name: entry.value for entry in power_of_target(PowerRequest(folder / "rates.csv")).inputs}
+    assert told["frame rate"] == "1000 to 4000 /s"
+    assert told["P_y of 24mm-200um-200mm"].startswith("0.435 psi")
+
+
 def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder):
     uncorrected = power_of_target(PowerRequest(folder))
     corrected = power_of_target(PowerRequest(folder, systematic_mm=0.0))

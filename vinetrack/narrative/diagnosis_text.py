@@ -74,7 +74,7 @@ POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", 
 def power_lines(power: Power) -> list[str]:
     """Return what `vinetrack power` prints: all effects in a table, visible ones first."""
     listed = power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))
-    lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
+    lines = [f"Power of {_count(power.n_trials, 'trial')} to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
     if power.wary:
         lines.append(f"! {power.wary}")

@@ -18,7 +18,7 @@ from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Trial
 from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
+from vinetrack.core.units import PREDICTION_UNITS, display_unit, number, pressure_text
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
@@ -50,6 +50,7 @@ from vinetrack.narrative.diagnosis_text import trial_text, value_in_unit, volume
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning import prediction as vines
 from vinetrack.planning.predictive_inputs import (
+    YIELD,
     Band,
     FitNumbers,
     PredictiveInputs,
@@ -520,11 +521,16 @@ def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
     fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
     inputs += [
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
-        PowerInput("frame rate", f"{rates[0]:g} /s", fps_origin),
+        PowerInput("frame rate", f"{' to '.join(map(number, sorted({min(rates), max(rates)})))} /s", fps_origin),
         *(
             PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", str(of_vine.origins[key]))
             for vine, of_vine in by_vine.items()
             for symbol, key in (("B", DAMPING), ("n", EXPONENT))
+        ),
+        *(
+            PowerInput(f"P_y of {vine}", pressure_text(of_vine.medians[YIELD], of_vine.trial.pressure_unit), str(why))
+            for vine, of_vine in by_vine.items()
+            if (why := of_vine.origins[YIELD]).code != "given"
         ),
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
