@@ -95,6 +95,8 @@ def test_the_name_of_a_condition_shows_what_differs():
         ("yield_pressure_Pa", 5e3, {"yield3kPa", "yield5kPa"}),
     ):
         assert conditions(field, value) == {f"{base}_{part}".rstrip("_") for part in parts}
+    in_psi = [replace(TRIAL, pressure_unit="psi", yield_pressure_Pa=psi * 6894.757293168361) for psi in (0.5, 0.7)]
+    assert [trial.condition.split("_")[-1] for trial in with_names(in_psi)] == ["yield0.5psi", "yield0.7psi"]
     # Another vine has a yield pressure of its own.
     named = with_names([TRIAL, replace(TRIAL, name="b", diameter_m=0.012, thickness_m=1e-4, yield_pressure_Pa=5e3)])
     assert [trial.condition for trial in named] == [base, "12mm-100um-280mm_28kPa_0g"]

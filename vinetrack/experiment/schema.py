@@ -288,13 +288,14 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     # Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last
     optional = sorted((c for c in COLUMNS.values() if c.condition_part), key=lambda column: column.kind == "bends")
     shown = [column for column in optional if len({_part(column, trial) for trial in trials}) > 1]
-    yields = Counter(vine for vine, _ in {(_vine(trial), _yield_pressure(trial)) for trial in trials})
+    yields = Counter(
+        vine for vine, _ in {(_vine(trial), _pressure(trial.yield_pressure_Pa, trial)) for trial in trials}
+    )
     named = []
     for trial in trials:
         vine = _vine(trial)
-        pressure = f"{_digits(UNITS[trial.pressure_unit].from_si(trial.pressure_Pa))}{trial.pressure_unit}"
-        parts = [vine, pressure, f"{_digits(trial.payload_kg * 1000)}g"]
-        parts += [_yield_pressure(trial)] if yields[vine] > 1 else []
+        parts = [vine, _pressure(trial.pressure_Pa, trial), f"{_digits(trial.payload_kg * 1000)}g"]
+        parts += [f"yield{_pressure(trial.yield_pressure_Pa, trial)}"] if yields[vine] > 1 else []
         parts += filter(None, (_part(column, trial) for column in shown))
         named.append(replace(trial, vine=vine, condition="_".join(parts)))
     return tuple(named)
@@ -315,8 +316,9 @@ def _vine(trial: Trial) -> str:
     return "-".join(f"{_digits(size)}{unit}" for size, unit in sizes if math.isfinite(size))
 
 
-def _yield_pressure(trial: Trial) -> str:
-    return f"yield{_digits(trial.yield_pressure_Pa / 1000)}kPa"
+def _pressure(pressure_Pa: float, trial: Trial) -> str:
+    """Return a pressure in the unit of the sheet."""
+    return f"{_digits(UNITS[trial.pressure_unit].from_si(pressure_Pa))}{trial.pressure_unit}"
 
 
 def _part(column: Column, trial: Trial) -> str:
