@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vinetrack.core.records import Floats, Kinematics, Trial
+from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.kernel import Trace
 from vinetrack.dynamics.model import Model, check_needs, effects_on
 from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, catalogue
@@ -178,6 +178,9 @@ def _chamber_pressure(hooks: _Hooks, state: State) -> Any:
     return pressure
 
 
+# Compression of the tail from which a model is in doubt, as a fraction of the drive ½PA (chosen)
+DOUBTFUL_COMPRESSION = 0.01
+
 COLUMNS = (
     "trial", "condition", "term", "size", "force_N", "share_of_drive", "shift_m", "time_s", "lead_position_m",
     "y_over_L", "slack_from_s", "note",
@@ -187,7 +190,8 @@ COLUMNS = (
 @dataclass(frozen=True)
 class AuditedMotion:
     """Motion of one trial since release, measured or simulated; arrays of shape (n,), SI. `pressure_Pa` is the gauge
-    pressure measured along with it, where there is one.
+    pressure measured along with it, where there is one; `by_model` a measured one's as the model has it: along that
+    is the tension, since a trial that is faster than its model by scatter would seem to push its tail.
     """
 
     trial: Trial
@@ -195,6 +199,7 @@ class AuditedMotion:
     lead_position_m: Floats
     lead_velocity_m_s: Floats
     pressure_Pa: Floats | None = None
+    by_model: AuditedMotion | None = None
 
     def thinned(self) -> AuditedMotion:
         """The same motion at 200 points or fewer."""
@@ -250,17 +255,16 @@ class Audit:
         return tuple(f"Trial {violation.trial}: {violation.words}." for violation in self.violations)
 
 
-def measured_motion(
-    trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
-) -> AuditedMotion:
-    """Motion of a trial as recorded, from its release on."""
-    k = kinematics
-    moving = (k.time_s >= release_s) & np.isfinite(k.lead_position_m) & np.isfinite(k.lead_velocity_m_s)
-    origin_m = np.interp(release_s, k.time_s, k.lead_position_m)
-    time_s = k.time_s[moving] - release_s
-    pressure = None if trace is None else np.interp(time_s, *trace)
-    position_m = np.maximum(k.lead_position_m[moving] - origin_m, 0.0)
-    return AuditedMotion(trial, time_s, position_m, np.maximum(k.lead_velocity_m_s[moving], 0.0), pressure)
+def motion_since(
+    release_s: float, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats,
+    trace: Trace | None = None, by_model: AuditedMotion | None = None,
+) -> AuditedMotion:  # fmt: skip
+    """Motion of one trial from its release on. Shapes: time_s, lead_position_m, lead_velocity_m_s (n,)."""
+    moving = (time_s >= release_s) & np.isfinite(lead_position_m) & np.isfinite(lead_velocity_m_s)
+    origin_m, since_s = np.interp(release_s, time_s, lead_position_m), time_s[moving] - release_s
+    position_m, velocity_m_s = (np.maximum(a[moving], 0.0) for a in (lead_position_m - origin_m, lead_velocity_m_s))
+    pressure_Pa = None if trace is None else np.interp(since_s, *trace)
+    return AuditedMotion(trial, since_s, position_m, velocity_m_s, pressure_Pa, by_model)
 
 
 def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
@@ -269,12 +273,12 @@ def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
     left = [e for e in catalogue().values() if e.kind != "measurement" and e.name not in replaced]
     rows: list[dict[str, Any]] = []
     violations: list[RuleViolation] = []
-    for motion in (motion.thinned() for motion in motions):
+    for motion, own in ((motion.thinned(), (motion.by_model or motion).thinned()) for motion in motions):
         terms = motion.terms(model)
         # A pressure measured during growth includes what happens in the chamber.
         neglected = [effect for effect in left if not (effect.in_trace and motion.pressure_Pa is not None)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
-        tension = _tension_row(motion, terms.tension_N)
+        tension = _tension_row(own, own.terms(model).tension_N)
         rows += [*left_out, tension]
         violated = _violated_rules(model, motion, {row["term"]: row for row in left_out}, tension)
         violations += [RuleViolation(motion.trial.name, rule, words) for rule, words in violated]
@@ -309,7 +313,7 @@ def _tension_row(motion: AuditedMotion, tension: Floats) -> dict[str, Any]:
     i = int(np.argmin(tension))
     drive = float(motion.drive_N()[i])
     share = float(tension[i]) / drive if drive > 0 else math.nan
-    negative = np.flatnonzero(tension < 0)
+    negative = np.flatnonzero(tension < -1e-6 * motion.drive_N())  # 1e-6: beyond the rounding of a simulation
     slack_from_s = float(motion.time_s[negative[0]]) if negative.size else math.nan
     return motion.row("tail_tension", i, force_N=float(tension[i]), share_of_drive=share, slack_from_s=slack_from_s)
 
@@ -334,7 +338,7 @@ def _violated_rules(
         safe = "which is safe to neglect below 30°"
         yield "bends", f"the path bends by {bent_deg:.0f}° in all, {safe}; add capstan_friction to the model"
     yield from _reservoir_rule(model, motion, neglected.get("reservoir_depletion"))
-    if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
+    if tension["share_of_drive"] < -DOUBTFUL_COMPRESSION and trial.tail_slack != "free":
         yield (
             "tension",
             f"the model predicts compression in the tail from {1e3 * tension['slack_from_s']:.0f} ms on (tension down "

@@ -10,6 +10,7 @@ import logging
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,7 @@ from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-from vinetrack.dynamics.audit import audit, measured_motion
+from vinetrack.dynamics.audit import audit, motion_since
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError, remember
@@ -95,9 +96,11 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
             messages.append(str(error))
         tracks, motions = {trial.name: track for trial, track in pairs}, []
         for trial in comparison.trials:
-            track = tracks[trial.name]
+            track, k = tracks[trial.name], kinematics[trial.name]
             trace = None if track.pressure_Pa is None else (track.time_s - trial.release_s, track.pressure_Pa)
-            motions.append(measured_motion(trial.trial, kinematics[trial.name], trial.release_s, trace))
+            since = partial(motion_since, trial.release_s, trial.trial, trace=trace)
+            own = since(trial.time_s, trial.predicted_position_m, trial.predicted_velocity_m_s)
+            motions.append(since(k.time_s, k.lead_position_m, k.lead_velocity_m_s, by_model=own))
         audited = audit(fit.model, motions)
         content = summary_of(fit, audited.warnings, tuple(messages)).to_json()
         trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]

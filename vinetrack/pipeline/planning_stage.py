@@ -528,9 +528,9 @@ def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
             for symbol, key in (("B", DAMPING), ("n", EXPONENT))
         ),
         *(
-            PowerInput(f"P_y of {vine}", pressure_text(of_vine.medians[YIELD], of_vine.trial.pressure_unit), str(why))
-            for vine, of_vine in by_vine.items()
-            if (why := of_vine.origins[YIELD]).code != "given"
+            PowerInput(f"P_y of {vine}", pressure_text(one.medians[YIELD], one.trial.pressure_unit), str(why))
+            for vine, one in by_vine.items()
+            if (why := one.origins[YIELD]).code != "given"
         ),
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})

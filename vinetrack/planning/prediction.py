@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import AMBIENT_PRESSURE_PA, display_unit
-from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
+from vinetrack.dynamics.audit import DOUBTFUL_COMPRESSION, AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import EffectError, catalogue
@@ -317,8 +317,8 @@ def _forces(
         tension_N = np.where(np.abs(terms.tension_N) < 1e-6 * drive_N, 0.0, terms.tension_N)
         moving = (m.lead_position_m <= places_m[-1]) & (m.lead_velocity_m_s > 0)
         least_N = np.min(tension_N[moving]) if moving.any() else math.nan
-        # 0.01: compression of the tail from which the model is in doubt, as a fraction of the drive ½PA (chosen)
-        slack = math.isfinite(m.slack_from_s) if trial.tail_slack == "free" else least_N < -0.01 * drive_N
+        pushes = least_N < -DOUBTFUL_COMPRESSION * drive_N
+        slack = math.isfinite(m.slack_from_s) if trial.tail_slack == "free" else pushes
         at_places = [np.interp(places_m, m.lead_position_m, y, right=math.nan) for y in (tension_N, terms.pressure_Pa)]
         of_trials.append((*at_places, least_N, slack))
     tension, pressure, least, is_slack = map(np.array, zip(*of_trials, strict=True))
