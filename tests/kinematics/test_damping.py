@@ -165,6 +165,14 @@ def test_where_yield_pressures_are_off_only_the_total_interval_covers():
     assert inner < outer
 
 
+def test_the_covariance_holds_what_trials_share():
+    """Exact points, forces all 2 % off and speeds 1 %: ln B errs by 2 % and by n times 1 %, and n not at all."""
+    points = campaign(default_rng(0), vines=("R4",))
+    points = points.assign(scale_rel_sigma=0.01, yield_force_sigma_N=0.02 * points["force_N"], force_sigma_N=0.0)
+    errors = np.sqrt(np.diag(fit_damping(points, resamples=20)["both_axes"]["covariance"]["matrix"]))
+    assert errors == pytest.approx([0.0, math.hypot(0.02, 0.01 * N)], abs=1e-4)
+
+
 def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone():
     """Exact points have no other error: speeds 1 % off make ln B 1.96·n·1 % wide either side."""
     points = campaign(default_rng(0)).assign(scale_rel_sigma=0.01, yield_force_sigma_N=0.0)

@@ -17,6 +17,7 @@ import numpy as np
 from vinetrack.core.units import interval, number, pressure_text, with_interval
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
+from vinetrack.kinematics.damping import student_95
 from vinetrack.narrative.diagnosis_text import METHOD_NAMES
 from vinetrack.paper import published
 
@@ -80,7 +81,8 @@ def _draw_law(
     force_N = B * x ** fit["n"]
     ax.plot(x, force_N, color=colour, ls=_METHOD_LINES[method], lw=1.5, zorder=2)
     if (sigma := log_force_sigma(fit, vine, x)) is not None:
-        factor = np.exp(1.96 * sigma)
+        dof = sum(law["n_trials"] for law in fit["vines"].values()) - len(fit["vines"]) - 1
+        factor = np.exp(student_95(dof) * sigma)
         st.band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
 
 

@@ -196,13 +196,16 @@ def _fit(
     design = np.column_stack([data.log_speed, data.member])
     variance = force_variance + n**2 * speed_variance if both_axes else np.full(n_points, scatter**2)
     covariance = np.asarray(np.linalg.pinv(design.T @ (design / variance[:, None])))
+    # What trials share: a yield pressure moves all forces of its vine, the scale all speeds
+    shared = np.column_stack([data.member * (data.yield_error / data.force)[:, None], n * data.scale_error])
+    moved = covariance @ (design.T / variance) @ shared
     draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
     total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
     estimate = np.concatenate([[n], log_B])
     # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter needs
     # Student's t instead of the normal distribution: percentile intervals are widened by as much.
     sizes = np.array([n_points / (1 + n_vines), *np.bincount(data.vine)])
-    student = _student(dof) / 1.959964
+    student = student_95(dof) / 1.959964
     widening = np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
     # 10: fewest points for bootstrap intervals (chosen)
     if n_points >= 10 and dof > 0:
@@ -210,7 +213,7 @@ def _fit(
         low, high = _percentiles(estimate, draws, widening)
     else:
         interval = "least squares and Student's t: too few trials to resample"
-        half_width = _student(dof) * np.sqrt(np.diag(covariance))
+        half_width = student_95(dof) * np.sqrt(np.diag(covariance))
         low, high = estimate - half_width, estimate + half_width
     low_total, high_total = _percentiles(estimate, total, widening)
     if not both_axes:
@@ -237,7 +240,10 @@ def _fit(
             }
             for i, name in enumerate(data.names)
         },
-        "covariance": {"parameters": ["n", *(f"ln B {name}" for name in data.names)], "matrix": covariance.tolist()},
+        "covariance": {
+            "parameters": ["n", *(f"ln B {name}" for name in data.names)],
+            "matrix": (covariance + moved @ moved.T).tolist(),
+        },
         "scatter": scatter,
         "n_trials": n_points,
         "interval": interval,
@@ -304,7 +310,8 @@ def _percentiles(estimate: Floats, draws: Floats, widening: Floats) -> tuple[Flo
     return estimate - widening * (estimate - low), estimate + widening * (high - estimate)
 
 
-def _student(dof: int) -> float:
+def student_95(dof: int) -> float:
+    """Half width of a 95 % interval, in standard errors."""
     return float(stdtrit(dof, 0.975)) if dof > 0 else math.inf
 
 
@@ -390,7 +397,7 @@ def _least_squares(columns: Iterable[Floats], y: Floats) -> tuple[list[float], l
     coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
     residual, dof = y - matrix @ coefficients, y.size - matrix.shape[1]
     errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / dof)
-    half_widths = _student(dof) * errors
+    half_widths = student_95(dof) * errors
     intervals = np.column_stack([coefficients - half_widths, coefficients + half_widths])
     p = np.where(errors > 0, 2 * stdtr(dof, -np.abs(coefficients) / np.maximum(errors, 1e-300)), 0.0)
     return coefficients.tolist(), intervals.tolist(), p.tolist(), _r_squared(y, residual)
