@@ -118,6 +118,13 @@ def test_an_adequate_model_is_off_by_as_much_as_the_scatter_of_trials_makes_expe
     assert compare(fitted(alone), alone).table["expected_m"].isna().all()
 
 
+def test_an_error_of_the_lens_which_trials_share_has_the_freedom_of_its_four_polynomials(pairs):
+    """It was counted as noise of every point, so that the range of an adequate model's error was far too narrow."""
+    course = ladder_module.ResidualCourse(pairs[0][0], np.zeros(99), np.zeros((99, 2)), np.zeros(99), 1e-14, 1e-8)
+    mean_m2, degrees, _ = ladder_module.mean_square([course] * 6, ladder_module.Scatter(1.0, 5))
+    assert (mean_m2, degrees) == pytest.approx((1e-8, 4.0), rel=1e-4)
+
+
 @pytest.mark.slow
 def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(pairs):
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]

@@ -200,7 +200,7 @@ class AlignedTrials:
         together, beyond, typical, dof = replicates_by_condition(self.trials), 0.0, 0.0, 0
         for condition, members in self.courses.items():
             if not math.isnan(floor_m := together[condition].floor_m):
-                beyond += sum(floor_m**2 - member.position_m2 for member in members)
+                beyond += sum(floor_m**2 - member.noise_m2 for member in members)
                 typical += sum(float(np.trace(member.typical_m2)) for member in members)
                 dof += len(members) - 1
         return Scatter(math.sqrt(max(beyond, 0.0) / typical) if typical > 0 else 1.0, dof)
@@ -225,15 +225,16 @@ def orthogonal_part(columns: Floats, others: Floats) -> Floats:
 
 
 class ResidualCourse(NamedTuple):
-    """One trial from its first motion on, arrays of shape (n_points, …): residual; response to one typical standard
-    deviation of pressure and of ln B, (n_points, 2); place along the growth; variance of a position by its own errors.
+    """One trial from its first motion on, (n_points, …): residual; response to one typical standard deviation of
+    pressure and of ln B, (n_points, 2); place along the growth; variances of a position by noise and by a lens.
     """
 
     trial: Trial
     residual_m: Floats
     response_m: Floats
     lead_position_m: Floats
-    position_m2: float
+    noise_m2: float
+    smooth_m2: float
 
     @property
     def typical_m2(self) -> Floats:
@@ -257,7 +258,8 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
         residual_m=trial.residual_m[moved],
         response_m=response[moved] * TYPICAL_SPREADS,
         lead_position_m=trial.predicted_position_m[moved] - trial.origin_m,
-        position_m2=trial_data.mean_noise_m**2 + trial_data.position_systematic_m**2,
+        noise_m2=trial_data.mean_noise_m**2,
+        smooth_m2=trial_data.position_systematic_m**2,
     )
 
 
@@ -272,15 +274,16 @@ class Scatter(NamedTuple):
 
 def mean_square(courses: Sequence[ResidualCourse], scatter: Scatter) -> tuple[float, float, float]:
     """Mean square error of an adequate model over trials of equal weight that scatter like replicates, m², its degrees
-    of freedom (Satterthwaite), and those of a single trial. That of a trial, S u + e with u ~ N(0, Σ), has the variance
-    2 tr((ΣSᵀS/n)²).
+    of freedom (Satterthwaite), and those of the scatter of a single trial. That of a trial, S u + e with u ~ N(0, Σ),
+    has the variance 2 tr((ΣSᵀS/n)²); a lens adds four polynomials that all trials share.
     """
-    shared = [scatter.multiple**2 * course.typical_m2 for course in courses]
-    mean_m2 = np.array([np.trace(of) + one.position_m2 for of, one in zip(shared, courses, strict=True)])
-    by_position = [one.position_m2**2 / len(one.residual_m) for one in courses]
-    variance_m4 = 2 * (np.array([np.trace(of @ of) for of in shared]) + by_position)
-    degrees = 2 * float(np.sum(mean_m2)) ** 2 / float(np.sum(variance_m4))
-    return float(np.mean(mean_m2)), degrees, float(np.mean(2 * mean_m2**2 / variance_m4))
+    scattered = [(one, scatter.multiple**2 * one.typical_m2) for one in courses]
+    own_m2 = np.array([np.trace(of) + one.noise_m2 for one, of in scattered])
+    variance_m4 = 2 * np.array([np.trace(of @ of) + one.noise_m2**2 / len(one.residual_m) for one, of in scattered])
+    smooth_m2 = sum(one.smooth_m2 for one in courses)
+    total_m2 = float(np.sum(own_m2)) + smooth_m2
+    degrees = 2 * total_m2**2 / (float(np.sum(variance_m4)) + 2 * smooth_m2**2 / 4)
+    return total_m2 / len(courses), degrees, float(np.mean(2 * own_m2**2 / variance_m4))
 
 
 def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
