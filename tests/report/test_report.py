@@ -70,6 +70,11 @@ def test_the_intervals_of_the_law_that_are_told_include_the_errors_that_trials_s
     assert "1.80 to 2.20" in damping_headline(damping("v"))
 
 
+def test_numbers_of_a_law_are_recommended_against_only_where_there_is_one():
+    told = [page(diagnosis=read(diagnosis()), damping=law) for law in (damping("v"), damping(refused="too few"))]
+    assert ["use those" in html for html in told] == [True, False]
+
+
 class Tags(HTMLParser):
     def __init__(self, html: str) -> None:
         super().__init__()
