@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -199,31 +199,33 @@ def _fit(
     # What trials share: a yield pressure moves all forces of its vine, the scale all speeds
     shared = np.column_stack([data.member * (data.yield_error / data.force)[:, None], n * data.scale_error])
     moved = covariance @ (design.T / variance) @ shared
-    draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
-    total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
     estimate = np.concatenate([[n], log_B])
-    # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter needs
-    # Student's t instead of the normal distribution: percentile intervals are widened by as much.
-    sizes = np.array([n_points / (1 + n_vines), *np.bincount(data.vine)])
-    student = student_95(dof) / 1.959964
-    widening = np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
     # 10: fewest points for bootstrap intervals (chosen)
     if n_points >= 10 and dof > 0:
         interval = "resampling whole trials"
-        low, high = _percentiles(estimate, draws, widening)
+        draws = _resample(data, speed_variance, force_variance, resamples, seed)
+        # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter
+        # needs Student's t instead of the normal distribution: percentile intervals are widened by as much.
+        sizes = np.array([n_points / (1 + n_vines), *np.bincount(data.vine)])
+        student = student_95(dof) / 1.959964
+        widening = np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
+        low, high = np.percentile(draws, [2.5, 97.5], axis=0)
+        low, high = estimate - widening * (estimate - low), estimate + widening * (high - estimate)
     else:
         interval = "least squares and Student's t: too few trials to resample"
         half_width = student_95(dof) * np.sqrt(np.diag(covariance))
         low, high = estimate - half_width, estimate + half_width
-    low_total, high_total = _percentiles(estimate, total, widening)
     if not both_axes:
         # N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F
         ones = np.ones_like(data.log_force)
         steep, steep_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
         shift = np.concatenate([steep, steep_B[0]]) - estimate
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
-        low_total, high_total = low_total + shift, high_total + shift
-    low_total, high_total = np.minimum(low, low_total), np.maximum(high, high_total)
+    by_shared = 1.959964 * np.sqrt(np.sum(moved**2, axis=1))
+    low_total, high_total = (
+        estimate - np.hypot(estimate - low, by_shared),
+        estimate + np.hypot(high - estimate, by_shared),
+    )
     return {
         "n": n,
         "n_95": [float(low[0]), float(high[0])],
@@ -283,31 +285,16 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
     return speed_variance, np.maximum(force_variance, 1e-14)
 
 
-def _resample(
-    data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_shared: bool
-) -> Floats:
-    """Fits to trials drawn with replacement within each vine, columns n and ln B; draws without a slope are dropped.
-    `with_shared` also draws the errors that trials share: of the yield pressure for each vine, of the scale for all.
-    """
+def _resample(data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int) -> Floats:
+    """Fits to trials drawn with replacement within each vine, columns n and ln B; draws without a slope are dropped."""
     random = np.random.default_rng(seed)
     counts = np.zeros((resamples, data.log_force.size))
     for i in range(len(data.names)):
         rows = np.flatnonzero(data.vine == i)
         counts[:, rows] = random.multinomial(rows.size, np.full(rows.size, 1 / rows.size), size=resamples)
-    log_force = data.log_force[None]
-    if with_shared:
-        shift = random.standard_normal((resamples, len(data.names)))[:, data.vine] * data.yield_error
-        log_force = np.log(np.maximum(data.force - shift, 1e-3 * data.force))
-        scale = random.standard_normal((resamples, 1)) * data.scale_error
-        data = replace(data, log_speed=data.log_speed + scale)
-    n, log_B = slope(log_force, counts, data, speed_variance, force_variance)
+    n, log_B = slope(data.log_force[None], counts, data, speed_variance, force_variance)
     draws = np.column_stack([n, log_B])
     return draws[np.isfinite(draws).all(axis=1) & (n > 0)]
-
-
-def _percentiles(estimate: Floats, draws: Floats, widening: Floats) -> tuple[Floats, Floats]:
-    low, high = np.percentile(draws, [2.5, 97.5], axis=0)
-    return estimate - widening * (estimate - low), estimate + widening * (high - estimate)
 
 
 def student_95(dof: int) -> float:
