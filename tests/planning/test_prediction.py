@@ -139,6 +139,13 @@ def test_persons_and_sheets_that_contradict_a_fit_go_before_it_and_the_fit_befor
     assert vt.predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 
 
+def test_a_stated_scatter_of_the_pressure_goes_before_that_of_a_fit():
+    told = [unsaid(**VINE, pressure_sigma_kPa=2), unsaid(**VINE)]
+    widths = [np.std(vt.predictive_inputs(one, None, fitted()).draw(4000, 1)[PRESSURE]) for one in told]
+    assert widths == pytest.approx([2000.0, 0.02 * 28e3 * math.sqrt(3)], rel=0.35)
+    assert vt.predictive_inputs(unsaid(**VINE)).spreads == (0.01, 0.03)
+
+
 def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three():
     draws = vt.predictive_inputs(unsaid()).draw(40_000, seed=1)[YIELD]
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)

@@ -297,8 +297,8 @@ def planned_rows(
     file: Path = Path(), *, measured: bool = False,
 ) -> Experiment:  # fmt: skip
     """Check the rows in use, and make an experiment of them without their recordings, unless there is an error. A yield
-    pressure that is not given is NaN, and all are vines, unless they are `measured`. Problems name the sheet, or
-    without a file the options.
+    pressure and a scatter of the pressure that are not given are NaN, and all are vines, unless they are `measured`.
+    Problems name the sheet, or without a file the options.
     """
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     remedy = "remove `use: no` from at least one row"
@@ -319,6 +319,7 @@ def planned_rows(
         raise ExperimentError(problems)
     for row in rows if not measured else ():
         row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
+        row.values.setdefault("pressure_sigma_kPa", math.nan)
         if "yield_pressure_kPa" not in row.values:
             row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
     trials = with_names([make_trial(row, Path(), settings) for row in rows])

@@ -364,7 +364,7 @@ class Room:
         """Return the trial with a vine of this size at the highest pressure allowed."""
         pressure_Pa = min(self.pressure_Pa, self.bearable_Pa(diameter_m, thickness_m))
         size: dict[str, Any] = {"diameter_m": diameter_m, "thickness_m": thickness_m, "length_m": length_m}
-        sized = replace(self.rig, **size, pressure_Pa=pressure_Pa, pressure_sigma_Pa=0.01 * pressure_Pa)
+        sized = replace(self.rig, **size, pressure_Pa=pressure_Pa)
         return with_names([sized])[0]
 
 

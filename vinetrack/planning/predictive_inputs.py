@@ -506,24 +506,26 @@ class _Assembly:
 
     def between_trials(self) -> tuple[float, float]:
         """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
-        (pressure, damping), origin = TYPICAL_SPREADS, "assumed"
-        trial, dof = self.trial, {"P": math.inf, "B": math.inf}
+        trial, known, stated = self.trial, dict(zip("PB", TYPICAL_SPREADS, strict=True)), self.stated.spreads
+        origins, dof = dict.fromkeys("PB", "assumed"), dict.fromkeys("PB", math.inf)
+        if self.fit is not None:
+            few = float(max(len(self.fit.fit.trials) - len(self.fit.fit.numbers), 3))
+            for name, one in self.fit.fit.spreads.items():
+                symbol = {"pressure": "P"}.get(name, name)
+                known[symbol], origins[symbol] = one.value, f"estimated in {self.fit.source}"
+                dof[symbol] = few if one.estimated else math.inf  # t of fewer degrees of freedom has no variance
         if trial.pressure_Pa > 0 and math.isfinite(trial.pressure_sigma_Pa):
-            pressure = trial.pressure_sigma_Pa / trial.pressure_Pa
-        if self.stated.spreads is not None:
-            (pressure, damping), origin = self.stated.spreads, "given"
-        elif self.fit is not None and self.fit.fit.spreads:
-            fit, origin = self.fit.fit, f"estimated in {self.fit.source}"
-            spread = {name: one.value for name, one in fit.spreads.items()}
-            pressure, damping = spread.get("pressure", pressure), spread.get("B", damping)
-            few = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
-            dof |= {{"pressure": "P"}.get(name, name): few for name, one in fit.spreads.items() if one.estimated}
+            known["P"], origins["P"], dof["P"] = trial.pressure_sigma_Pa / trial.pressure_Pa, "stated", math.inf
+        if stated is not None:
+            known, origins = dict(zip("PB", stated, strict=True)), dict.fromkeys("PB", "given")
+            dof = dict.fromkeys("PB", math.inf)
         self.set(PRESSURE, trial.pressure_Pa, "set")
-        for symbol, name, size in (("P", PRESSURE, pressure), ("B", DAMPING, damping)):
-            why, key = remark("spread", origin=origin, percent=100 * size), f"{symbol} trial|{trial.vine}"
-            sigma, log = max(size, 0.0) * (trial.pressure_Pa if symbol == "P" else 1.0), symbol == "B"
+        for symbol, name in (("P", PRESSURE), ("B", DAMPING)):
+            why = remark("spread", origin=origins[symbol], percent=100 * known[symbol])
+            sigma, log = max(known[symbol], 0.0) * (trial.pressure_Pa if symbol == "P" else 1.0), symbol == "B"
+            key = f"{symbol} trial|{trial.vine}"
             self.vary(name, sigma, f"{symbol} from trial to trial", key, why, log=log, dof=dof[symbol])
-        return pressure, damping
+        return known["P"], known["B"]
 
 
 def predictive_inputs(
