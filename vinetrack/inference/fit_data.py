@@ -51,7 +51,7 @@ class FitError(UserError, ValueError):
 
 @dataclass(frozen=True)
 class ImpreciseRest:
-    """A rest before the motion with large stated errors, such as behind a door: its end, position and error."""
+    """A rest before the motion whose points share an error, or have large ones: its end, position and error."""
 
     release_s: float
     origin_m: float
@@ -240,9 +240,10 @@ def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
 
 def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
     """Points whose stated error is several times that of the others, such as an edge half behind the door. Also the
-    position and end of the rest before the motion, where it consists of such points.
+    position and end of the rest before the motion, where it consists of such points, or of a recording's, whose pictures
+    of one edge share its slow error: together they are worth one point.
     """
-    sigma_m = track.lead_position_sigma_m
+    sigma_m, share_an_error = track.lead_position_sigma_m, track.lead_position_systematic_m is not None
     if track.lead_position_systematic_m is not None:
         sigma_m = np.hypot(sigma_m, np.nan_to_num(track.lead_position_systematic_m))
     stated = usable & np.isfinite(sigma_m)
@@ -250,12 +251,12 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
         return np.zeros(usable.size, dtype=bool), None
     precise_half_m = sigma_m[stated & (sigma_m <= np.median(sigma_m[stated]))]
     # 3.0, 0.3, 0.5: A point is left out if its stated error exceeds the median of the better half by this factor,
-    # provided that at least the second fraction of points remains (chosen)
+    # provided that at least the second fraction of those in motion remains (chosen)
     imprecise = stated & (sigma_m > 3.0 * np.median(precise_half_m))
     usable_points = np.flatnonzero(usable)
     at_rest = usable_points[: rest_points(track.lead_position_m[usable_points])]
     imprecise_rest = None
-    if 0 < at_rest.size < usable_points.size and np.mean(imprecise[at_rest]) > 0.5:
+    if 0 < at_rest.size < usable_points.size and (share_an_error or np.mean(imprecise[at_rest]) > 0.5):
         # The few remaining points of such a rest would determine the origin alone.
         imprecise[at_rest] = True
         imprecise_rest = ImpreciseRest(
@@ -263,8 +264,10 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
             origin_m=float(np.median(track.lead_position_m[at_rest])),
             sigma_m=float(np.median(sigma_m[at_rest])),
         )
-    enough_precise = np.count_nonzero(usable & ~imprecise) >= max(FEWEST_POINTS, 0.3 * np.count_nonzero(usable))
-    return (imprecise, imprecise_rest) if enough_precise else (np.zeros(usable.size, dtype=bool), None)
+    least = max(FEWEST_POINTS, 0.3 * (usable_points.size - at_rest.size))
+    if np.count_nonzero(usable & ~imprecise) < least:
+        return np.zeros(usable.size, dtype=bool), None
+    return imprecise, imprecise_rest
 
 
 def _quantised_points(
