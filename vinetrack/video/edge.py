@@ -109,12 +109,13 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
     # too far back, film serves as its own background; without contrast nothing corrects it.
-    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
+    contrast = np.median(np.abs(appearance[0] - appearance[1]), axis=0)
     columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
     near = (columns > state.edge[0] - 5) & (columns < clear)
     later = (columns >= clear) & (columns < state.edge.max() - 5)
     # 0.4: part of the typical contrast below which film and background are the same material (chosen)
     film_all_along = near & (contrast < 0.4 * float(np.median(contrast[later]))) if later.sum() >= 10 else near & False
+    film_all_along[near] = np.logical_and.accumulate(film_all_along[near])
     if film_all_along.any():
         sums[1, :, :, film_all_along] = 0.0
         appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
@@ -340,7 +341,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
             ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
-                if replacement is not None and (faint or replacement[2] < out[t, 2]):
+                if replacement is not None and replacement[2] < out[t, 2]:
                     out[t] = replacement
             elif not faint and is_better and step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25:
                 continue  # two to four whole steps: frames are missing, and the point is right
