@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -28,6 +29,8 @@ from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.inference.trial_effects import trial_costs, white_at_releases
+from vinetrack.interface.loaded import ERROR_COLUMNS
+from vinetrack.tracks.position_noise import rest_points
 
 
 @pytest.fixture(scope="module")
@@ -465,6 +468,27 @@ def test_a_rest_counts_as_one_point_where_rounding_hides_its_noise():
         assert each.imprecise_rest.sigma_m == pytest.approx(STEP_M / np.sqrt(12))
         assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
     assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
+
+
+def test_an_error_that_the_pictures_of_a_rest_share_moves_nothing():
+    """Pictures of one edge. As points with noise of their own they moved n by 1.3 σ."""
+
+    def fit_with_rests_off_by(error_m):
+        pairs = []
+        for trial, track in small_campaign(21, rho=0.3)[0]:
+            at_rest = np.arange(track.time_s.size) < rest_points(track.lead_position_m)
+            stated = {name: np.full(at_rest.size, 5e-5) for name in ERROR_COLUMNS}
+            seen = replace(track, lead_position_m=track.lead_position_m + error_m * at_rest, **stated)
+            pairs.append((replace(trial, video=Path("a.mp4")), seen))
+        fit = vt.fit(vt.base_model(), pairs, profile=False)
+        tests = misfit_tests(fit, candidates_of(fit.model, None, None), FALSE_ALARM_LEVEL_FIRST_ROUND)
+        return fit, tests
+
+    (right, before), (off, after) = fit_with_rests_off_by(0.0), fit_with_rests_off_by(-2e-4)
+    assert all(each.n_rest == 0 and each.imprecise_rest is not None for each in off.predictor.data)
+    moved = [(b.value - a.value) / a.sigma for a, b in zip(right.numbers, off.numbers, strict=True)]
+    assert np.abs(moved).max() < 0.2
+    assert not before.rejects_model and not after.rejects_model
 
 
 def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_travel():
