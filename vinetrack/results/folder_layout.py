@@ -223,15 +223,18 @@ def measured_trials(
         failed = set(gathered.loc[gathered["status"] == "failed", "trial"])
     for trial in experiment.trials:
         table = read_result(results.track(trial.name))
-        if len(table) and trial.name not in failed:
+        if not len(table) or trial.name in failed:
+            continue
+        with _reading(results.track(trial.name)):
             pairs.append((trial, read_stored_track(table)))
-            motion = read_result(results.kinematics(trial.name))
+        motion = read_result(results.kinematics(trial.name))
+        with _reading(results.kinematics(trial.name)):
             columns: dict[str, Any] = {
                 name: motion[name].to_numpy(dtype=float) for name in KINEMATICS_COLUMNS if name != "tail_velocity_m_s"
             }
-            # Smoothing windows and noise are not stored.
-            columns |= {"window_points": np.zeros(len(motion), dtype=int), "noise_m": np.nan}
-            kinematics[trial.name] = Kinematics(**columns, noise_correlation=np.nan, travel_ratio=trial.travel_ratio)
+        # Smoothing windows and noise are not stored.
+        columns |= {"window_points": np.zeros(len(motion), dtype=int), "noise_m": np.nan}
+        kinematics[trial.name] = Kinematics(**columns, noise_correlation=np.nan, travel_ratio=trial.travel_ratio)
     return pairs, kinematics
 
 
