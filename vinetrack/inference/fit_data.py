@@ -240,8 +240,8 @@ def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
 
 def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
     """Points whose stated error is several times that of the others, such as an edge half behind the door. Also the
-    position and end of the rest before the motion, where it consists of such points, or of a recording's, whose pictures
-    of one edge share its slow error: together they are worth one point.
+    position and end of the rest before the motion, where it consists of such points or is that of a recording: pictures
+    of one edge share its slow error, and together they are worth one point.
     """
     sigma_m, share_an_error = track.lead_position_sigma_m, track.lead_position_systematic_m is not None
     if track.lead_position_systematic_m is not None:
