@@ -234,6 +234,15 @@ def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
     assert math.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.3)
 
 
+def test_a_pull_is_judged_by_the_errors_that_are_stated():
+    """Those of the fit with its systematic errors, which estimates the scatter of trials anew."""
+    fit = fitted()
+    state = replace(fit.solution.state, spread=(0.04, 0.15))
+    moved = replace(fit, solution=replace(fit.solution, state=state))
+    before, after = ([test["change_sigma"] for test in against_the_sheet(one)] for one in (fit, moved))
+    assert after == pytest.approx(before, rel=0.1)
+
+
 def test_a_fit_that_no_step_improves_far_from_its_optimum_has_not_converged(monkeypatch):
     fit = fitted()
     start = replace(fit.solution.state, theta=fit.solution.state.theta + 0.5)

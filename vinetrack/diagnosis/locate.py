@@ -36,7 +36,7 @@ from vinetrack.diagnosis.ladder import (
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
-from vinetrack.inference.errors import robust_variances
+from vinetrack.inference.errors import precision, with_systematics
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
@@ -369,9 +369,10 @@ def _steady_change(
 def against_the_sheet(fit: Fit) -> Iterator[Row]:
     """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
-    fit adds to σ² for scatter and shared errors comes on top.
+    fit adds to σ² for scatter comes on top.
     """
-    plain = np.diag(robust_variances(fit.predictor, fit.solution)[0])
+    extended = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
+    plain = np.diag(precision(extended).first(len(fit.numbers)).covariance)
     for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
         if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
