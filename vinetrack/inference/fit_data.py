@@ -297,7 +297,9 @@ def _cannot_be_driven(trial: Trial) -> bool:
 
 
 def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
-    """Frames on the last twentieth of the growth, and the first two after its end."""
+    """Frames on the last twentieth of the growth, and the first two after its end; all of these where the track begins
+    in motion, and so does not tell how far it has grown.
+    """
     excluded = np.zeros(track.time_s.size, dtype=bool)
     points = np.flatnonzero(track.usable if trial.video else track.usable | with_flag(track.flag, "after_end"))
     if not np.isfinite(trial.length_m) or points.size < FEWEST_POINTS:
@@ -314,7 +316,7 @@ def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
     end_reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
     last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if end_reached else np.inf
     near_end = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
-    if end_reached:
+    if end_reached and n_rest:
         # While steps are below the noise, the end is uncertain by as many frames; after them the model has stopped too.
         step_m = max(float(np.median(np.diff(y[max(end - 10, 0) : end]))), 1e-9)
         near_end[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
