@@ -1,6 +1,7 @@
 """The force that a model lacks: its algebra against closed forms, hidden forces, their laws and effect files."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -116,6 +117,15 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     # A spring far too stiff for the steps is at rest there: the method is L-stable.
     stiff, _ = inversion.integrate_responses(time_s, -1e10 + 0 * time_s, *pushed[1:])
     assert stiff[0, -1, 0] == pytest.approx(1e-10)
+
+
+def test_a_step_that_leaves_a_trial_without_points_leads_where_nothing_can_be_computed(tmp_path):
+    pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
+    problem = inversion.ForceProblem(vt.fit(vt.base_model(), pairs, profile=False))
+    domain = learning.candidate_domains(problem.start.motions)[0]
+    late = replace(problem.start, trial_effects=problem.start.trial_effects - [0.0, 1.0, 0.0, 0.0])
+    with pytest.raises(np.linalg.LinAlgError):
+        inversion.ForceEquations(problem, late, domain.unit_push)
 
 
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):

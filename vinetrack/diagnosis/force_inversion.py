@@ -418,6 +418,8 @@ class ForceEquations:
         # Where a usual deviation would move a trial by more than it travels, no small force can be told.
         moved_m = np.max(np.abs(sensitivities[:, :2] * self.problem.state.spread), axis=1)
         ended = (grown_m > MOST_OF_LENGTH * trial_data.trial.length_m) | (moved_m > np.ptp(grown_m))
+        if ended[0]:
+            raise np.linalg.LinAlgError(f"none of the positions of {trial_data.trial.name} tells a force")
         used = slice(0, int(np.argmax(ended)) if ended.any() else None)
         relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
         return products(columns[used], trial_data.first[used], relative_sd)
