@@ -409,3 +409,13 @@ def test_noise_that_grows_along_the_way_is_told_from_a_dropped_frame():
         assert not with_flag(correct_frames(track).flag, "retimed").any()
         found += "retimed" in flags(correct_frames(dropped(track, 80))).get(80, "")
     assert found >= 36
+
+
+@pytest.mark.parametrize("rounding_m", [3e-4, 1e-6])
+def test_a_slow_track_that_begins_in_motion_is_not_at_rest_in_its_first_frames(rounding_m):
+    draws = np.random.default_rng(5)
+    steady = [2e-4 * np.arange(400) + 1e-4 * draws.standard_normal(400) for _ in range(200)]
+    begun = [np.append(1e-4 * draws.standard_normal(20), y) for y in steady]
+    found = [[module.rest_points(np.round(y / rounding_m) * rounding_m) for y in tracks] for tracks in (steady, begun)]
+    assert np.count_nonzero(found[0]) <= 4
+    assert np.count_nonzero(found[1]) >= 196

@@ -254,8 +254,10 @@ def rest_points(position_m: Floats) -> int:
     mean_y = float(y.mean())
     slope = centred @ (y - mean_y) / np.sum(centred**2, axis=1)
     cost = np.sum((y - mean_y) ** 2) - slope**2 * np.sum(centred**2, axis=1)
-    best = int(corners[int(np.argmin(cost))])
-    return best + 1 if best > 0 else 0
+    best = int(np.argmin(cost))
+    # 4.0: fall of the squares, in (2σ)², by which a corner must beat a track that moves from its first point (chosen)
+    is_corner = cost[best] < cost[0] - 4.0 * noise_m**2
+    return int(corners[best]) + 1 if corners[best] > 0 and (is_corner or corners[0] > 0) else 0
 
 
 def turning_point(position: Floats, back: Floats | float) -> int | None:
