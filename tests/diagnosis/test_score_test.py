@@ -130,10 +130,26 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
 )
 def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, residual_m, systematic_m, exceeds):
     """Of 100 mm of growth. Nothing is then sought beyond a model that passes: 14 s instead of 71 for 24 films."""
-    track = SimpleNamespace(position_systematic_m=systematic_m, lead_position_m=np.array([0.0, 0.1]))
+    trial = SimpleNamespace(condition="all")
+    track = SimpleNamespace(position_systematic_m=systematic_m, lead_position_m=np.array([0.0, 0.1]), trial=trial)
     solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3)
     fit = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
+
+
+@pytest.mark.parametrize("replicates_missed", [1, 2])
+def test_a_condition_that_is_missed_in_every_replicate_is_far_off_though_most_trials_are_not(replicates_missed):
+    names, missed = ["low", "low", "a", "a", "b", "b", "b"], [True] * replicates_missed + [False] * 6
+    data = [
+        SimpleNamespace(
+            position_systematic_m=0.0, lead_position_m=np.array([0.0, 0.1]), trial=SimpleNamespace(condition=name)
+        )
+        for name in names
+    ]
+    columns = [np.full((4, 1), 2e-3 if far else 1e-6) for far in missed[:7]]
+    solution = SimpleNamespace(columns=columns)
+    fit = SimpleNamespace(chi2_per_dof=900.0, predictor=SimpleNamespace(data=data), solution=solution)
+    assert misfit_tests.exceeds_slow_errors(fit) == (replicates_missed == 2)
 
 
 def test_scores_that_a_specimen_shares_count_once():
