@@ -91,7 +91,7 @@ def diagnose(
     else:
         fit = with_host(fitted, host_for(model, effects))
     unfit: dict[str, list[str]] = {}
-    for name, reason in fit.left_out.items():
+    for name, reason in {**left_out, **fit.left_out}.items():
         unfit.setdefault(reason, []).append(name)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
     if odd := odd_trials(fit.predictor.data):
