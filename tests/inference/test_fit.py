@@ -489,7 +489,7 @@ def test_an_error_that_the_pictures_of_a_rest_share_moves_nothing():
     assert all(each.n_rest == 0 and each.imprecise_rest is not None for each in off.predictor.data)
     moved = [(b.value - a.value) / a.sigma for a, b in zip(right.numbers, off.numbers, strict=True)]
     assert np.abs(moved).max() < 0.2
-    assert not (before.rejects_model or after.rejects_model)
+    assert [before.rejects_model, after.rejects_model] == [False, False]
 
 
 def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_travel():

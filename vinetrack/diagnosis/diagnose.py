@@ -70,45 +70,46 @@ def diagnose(
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
+    from vinetrack.experiment.folder import Experiment, read_experiment
+
     if isinstance(source, Fit):
         fitted, model, source = source, source.model, source.pairs
-    settings = _settings(source)
-    if settings is not None:
-        source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
-        model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
-        candidates = stated_candidates if candidates is None else candidates
-        limits = limits or stated_limits
+    if isinstance(source, (str, Path)):
+        source = read_experiment(source)
+    if isinstance(source, Experiment):
+        settings, own_effects = source.settings, source.user_effects
+        model = model or make_model(settings.model, own_effects)
+        user_effects = {**own_effects, **(user_effects or {})}
+        candidates = settings.candidates if candidates is None else candidates
+        limits = limits or settings.limits
     model = model or base_model()
     effects = candidates_of(model, candidates, user_effects)
     pairs, left_out = pairs_of(source, tracks)
-    if settings is None:  # the tracks of an experiment were corrected as they were read
+    if not isinstance(source, Experiment):  # whose tracks were corrected as they were read
         pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
     dropped = lost_frames(pairs)
-    outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
     report("fitting the model")
     if fitted is None or dropped:
         fit = initial_fit(model, pairs, effects, profile=False)
     else:
         fit = with_host(fitted, host_for(model, effects))
     unfit: dict[str, list[str]] = {}
+    by_request = source.left_out if isinstance(source, Experiment) else {}
     for name, reason in {**left_out, **fit.left_out}.items():
-        unfit.setdefault(reason, []).append(name)
+        if name not in by_request:
+            unfit.setdefault(reason, []).append(name)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
     if odd := odd_trials(fit.predictor.data):
         told.append(remark("odd_trials", odd=odd, count=len(fit.trials)))
         others = [pair for pair in pairs if pair[0].name not in {trial.name for trial in odd}]
         fit = initial_fit(model, others, effects, profile=False)
     result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
-    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
-    result = with_lost_frames(result, dropped)
-    result = replace(result, notes=(*result.notes, *told))
-    if longer := longer_than_stated(pairs):
-        result = replace(result, notes=(*result.notes, longer))
+    result = with_lost_frames(replace(result, odd_trials=tuple(trial.name for trial in odd)), dropped)
+    told.append(longer_than_stated(pairs))
     if far_off := _far_off(result.fits[-1]):
-        told = [remark("far_off", names=list(far_off), percent=100 * max(far_off.values()))]
-        result = replace(result, notes=(*result.notes, *told))
-    if outliers_note:
-        result = replace(result, notes=(*result.notes, outliers_note))
+        told.append(remark("far_off", names=list(far_off), percent=100 * max(far_off.values())))
+    outliers = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
+    result = replace(result, notes=(*result.notes, *filter(None, (*told, outliers))))
     if ladder:
         report("errors before and after")
         result = _or_note(result, "no_ladder", partial(_with_ladder, result))
@@ -147,21 +148,6 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
         fits=(fit, *(step.tests.fit for step in steps[1:])),
         power=power_of(steps[-1].tests, not_testable),
     )
-
-
-def _settings(
-    source: Experiment | Path | str | Pairs,
-) -> tuple[Experiment, Model, tuple[str, ...] | None, dict[str, Effect], Limits] | None:
-    """An experiment with the model, candidates, own effects and limits that it states; None for bare pairs."""
-    from vinetrack.experiment.folder import Experiment, read_experiment
-
-    if isinstance(source, (str, Path)):
-        source = read_experiment(source)
-    if not isinstance(source, Experiment):
-        return None
-    settings = source.settings
-    user_effects = source.user_effects
-    return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
 def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
