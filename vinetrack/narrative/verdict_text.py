@@ -268,7 +268,9 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
         return "", ""
     if power.wary or not power.effects:
         return "sizes that trials would detect were not computed", str(power.wary)
-    missed = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
+    found = {name for entry in diagnosis.rounds for name in entry.answer_set}
+    unlikely = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
+    missed = [name for name in unlikely if name not in found]
     facts = {"seen": len(power.effects) - len(missed), "count": len(power.effects) + len(power.not_testable)}
     unseen = {"not even then": missed, "not testable with these trials": [*power.not_testable]}
     named = [f"{why}: {listed_names(names)}" for why, names in unseen.items() if names]
