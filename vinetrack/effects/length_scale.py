@@ -6,9 +6,10 @@ to the camera is one per cent of length.
     y → (1 + ε) y, reported from true
 
 Easily taken for an error of B or for drag; together with errors of frame rate, pressure and B it is undetectable in one
-loaded trial, to a fraction of a micrometre. The end of growth at a known length shows it.
+loaded trial, to a fraction of a micrometre. The end of growth at a known length shows it, and a stated length that is
+off by as much looks the same, as one does that counts what was everted at the start.
 
-Reduce it with a calibration target in the plane of growth, or a ruler beside the vine.
+Reduce it with a calibration target in the plane of growth, or a ruler beside the vine; measure what grows.
 
 Source: the geometry of projection; Hartley & Zisserman (2004), Multiple View Geometry in Computer Vision.
 """
