@@ -594,7 +594,7 @@ LARGEST_MISSED = 0.1  # Misfit of a trial, as a part of its growth, that no erro
 
 def exceeds_slow_errors(fit: Fit) -> bool:
     """Whether the misfit of a fit exceeds the noise and, as a part of the growth of the median trial, the slow errors
-    of the tracks; or far more of that of all replicates of a condition, or of any trial, than an error of a track.
+    of the tracks, or of all replicates of a condition; or more of any trial than an error of a track explains.
     """
     data = fit.predictor.data
     systematic = float(
@@ -603,9 +603,7 @@ def exceeds_slow_errors(fit: Fit) -> bool:
     missed = relative_residuals(fit.predictor, fit.solution)
     _, places = np.unique([trial_data.trial.condition for trial_data in data], return_inverse=True)
     shared = max((np.min(missed[places == k]) for k in np.flatnonzero(np.bincount(places) > 1)), default=0.0)
-    slow = max(MISSED_FRACTION, systematic)
-    # 5.0: how much further than the median trial all replicates of a condition may be missed (chosen)
-    beyond = np.median(missed) > slow or shared > 5.0 * slow or np.max(missed) > LARGEST_MISSED
+    beyond = max(np.median(missed), shared) > max(MISSED_FRACTION, systematic) or np.max(missed) > LARGEST_MISSED
     return bool(fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and beyond)
 
 
