@@ -239,7 +239,7 @@ def test_missing_frames_begin_a_new_stretch_and_points_flagged_unusable_are_not_
 
 
 @pytest.mark.parametrize("first", [0, 30])
-def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept_if_the_beginning_was_seen(first):
+def test_points_near_the_end_of_growth_are_left_out_and_one_behind_it_kept_if_the_beginning_was_seen(first):
     trial, time_s = vine_trial("end", 22), np.arange(400) / FPS
     position = grown_position(trial, time_s - 0.02, B_TRUE[24.0])
     until = np.flatnonzero(np.isnan(position))[12]
@@ -248,7 +248,21 @@ def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept_if_the_b
     track = as_track(time_s[first:until], (position + noise)[first:])
     travel = vt.fit(vt.base_model(), [(trial, track)], fixed=("B", "n"), profile=False).trials[0].lead_position_m
     assert not np.any((travel > 0.951 * trial.length_m) & (travel < 0.99 * trial.length_m))
-    assert (np.count_nonzero(travel > 0.99 * trial.length_m) >= 5) == (first == 0)
+    assert np.count_nonzero(travel > 0.99 * trial.length_m) == (first == 0)
+
+
+def test_a_vine_that_ends_short_of_its_stated_length_is_no_misfit():
+    """By half a per cent, 14 times the noise of a position. Taken as exact, the length gave χ² 177, n 0.383 ± 0.002."""
+    draw, pairs, time_s = np.random.default_rng(5), [], np.arange(800) / FPS
+    for pressure_kPa in (20, 24, 29, 35):
+        trial = vine_trial(f"{pressure_kPa}", pressure_kPa)
+        position_m = grown_position(trial, time_s - 0.02, B_TRUE[24.0])
+        seen = slice(0, np.flatnonzero(np.isnan(position_m))[20])
+        position_m = np.nan_to_num(position_m[seen], nan=0.995 * trial.length_m)
+        pairs.append((trial, as_track(time_s[seen], position_m + NOISE_M * draw.standard_normal(position_m.size))))
+    fit = vt.fit(vt.base_model(), pairs, profile=False)
+    assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma < 0.1
+    assert fit.chi2_per_dof < 1.3
 
 
 def test_a_measured_pressure_replaces_the_set_pressure():

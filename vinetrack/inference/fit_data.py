@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
 
+LENGTH_ERROR = 0.005  # Standard deviation of a vine's length, relative (chosen)
 FRAMES_BEHIND_END = 2  # Frames left out after the end of growth (derived)
 
 
@@ -83,6 +85,7 @@ class FitTrial:
     blur_s: float = 0.0
     smoothing: Smoothing | None = None  #: how positions were smoothed of which one in several is kept
     smoothed_frame_s: float = 0.0  #: spacing of the frames that were smoothed over, s
+    sees_end: bool = False  #: whether the last point lies behind the end of growth
 
     @cached_property
     def frame_s(self) -> float:
@@ -104,10 +107,8 @@ class FitTrial:
 
     @property
     def mean_noise_m(self) -> float:
-        """Root mean square of the noise of the points, m."""
-        if self.relative_sd is None:
-            return self.noise_m
-        return self.noise_m * math.sqrt(float(np.mean(self.relative_sd**2)))
+        """Root mean square of the noise of the points before the end of growth, m."""
+        return self.noise_m * math.sqrt(float(np.mean(self.point_sd[: self.time_s.size - self.sees_end] ** 2)))
 
     @property
     def shows_rest(self) -> bool:
@@ -148,7 +149,8 @@ def prepare_trial(
 ) -> FitTrial:
     """The data of one trial: its usable points, rest included, and the noise that they show."""
     fewest_moving = 4  # A trial with fewer points in motion is refused (derived)
-    usable = track.usable & ~_near_end_of_growth(trial, track)
+    excluded, end = _near_end_of_growth(trial, track)
+    usable = track.usable & ~excluded
     imprecise, imprecise_rest = _imprecise_points(track, usable)
     usable &= ~imprecise
     smoothing, rounding_m = (smoothing, rounding_m) if trial.video is None else (None, 0.0)
@@ -214,6 +216,7 @@ def prepare_trial(
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
         smoothed_frame_s=smoothed_frame_s,
+        sees_end=bool(usable[end].any()),
     )
 
 
@@ -296,14 +299,15 @@ def _cannot_be_driven(trial: Trial) -> bool:
     return trial.travel_ratio != 1 and trial.payload_kg == 0 and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa
 
 
-def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
-    """Frames on the last twentieth of the growth, and the first two after its end; all of these where the track begins
-    in motion, and so does not tell how far it has grown.
+def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], NDArray[np.int_]]:
+    """Frames on the last twentieth of the growth and after its end, but for the last one: a standstill at the end shows
+    how long the vine is, and is worth one point. All of them where the track begins in motion, and so does not tell how
+    far it has grown. Returns excluded, kept (index of the last frame, if it lies behind the end; shape (0,) or (1,)).
     """
     excluded = np.zeros(track.time_s.size, dtype=bool)
     points = np.flatnonzero(track.usable if trial.video else track.usable | with_flag(track.flag, "after_end"))
     if not np.isfinite(trial.length_m) or points.size < FEWEST_POINTS:
-        return excluded
+        return excluded, points[:0]
     y = track.lead_position_m[points]
     noise_m = rough_noise(y) + 1e-9
     n_rest = rest_points(y)
@@ -315,13 +319,11 @@ def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
     end = int(moving[-1]) + 1 if moving.size else y.size
     end_reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
     last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if end_reached else np.inf
-    near_end = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
-    if end_reached and n_rest:
-        # While steps are below the noise, the end is uncertain by as many frames; after them the model has stopped too.
-        step_m = max(float(np.median(np.diff(y[max(end - 10, 0) : end]))), 1e-9)
-        near_end[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
-    excluded[points[near_end]] = True
-    return excluded
+    excluded[points[y > min(begin_m + END_FRACTION * trial.length_m, last_m)]] = True
+    behind = points[end + FRAMES_BEHIND_END :] if end_reached and n_rest else points[:0]
+    kept = behind[track.usable[behind]][-1:]
+    excluded[kept] = False
+    return excluded, kept
 
 
 def pairs_of(
@@ -423,7 +425,21 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
     for i, one in enumerate(data):
         if not math.isfinite(one.trial.position_systematic_m):
             data[i] = replace(one, position_systematic_m=max(one.position_systematic_m, lens_m))
-    return _with_weighted_points(data) if weighted else data, left_out
+    return _with_errors_of_length(_with_weighted_points(data) if weighted else data), left_out
+
+
+def _with_errors_of_length(data: list[FitTrial]) -> list[FitTrial]:
+    """The trials with their ends weighted by the error of their vine's length, which its trials share: together they
+    are worth one measurement of it.
+    """
+    of_vine = Counter(each.trial.vine for each in data if each.sees_end)
+    for i, each in enumerate(data):
+        if each.sees_end:
+            relative_sd = each.point_sd.copy()
+            error_m = LENGTH_ERROR * each.trial.length_m * math.sqrt(of_vine[each.trial.vine])
+            relative_sd[-1] = math.hypot(relative_sd[-1], error_m / each.noise_m)
+            data[i] = replace(each, relative_sd=relative_sd)
+    return data
 
 
 def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:

@@ -232,7 +232,7 @@ def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
     pressures that the fit corrected.
     """
     notes = []
-    weighted = [trial_data for trial_data in data if trial_data.relative_sd is not None]
+    weighted = [each for each in data if np.ptp(each.point_sd[: each.time_s.size - each.sees_end]) > 0]
     if weighted and weighted[0].blur_s > 0:
         notes.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
     elif weighted:
