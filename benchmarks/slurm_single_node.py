@@ -1,12 +1,11 @@
 """Three recordings through a real Slurm of one machine, and the same locally: whether all results are the same bytes.
 
-    python tests/slurm/single_node.py [--install]
+    python benchmarks/slurm_single_node.py [--install]
 
 Run as root on Debian or Ubuntu. With --install Debian's `slurm-wlm` and `munge` are installed first where they are
 missing. A controller, a node and munge are started in a folder and on ports of their own, without accounting, under
 /etc/slurm/slurm.conf, which must not be there before; the workflow is run with `profiles/slurm`, then with `--cores 2`;
-every file but the logs is compared; all that was started is stopped, and that file is taken away again. It is not
-collected by pytest, since it needs root and two packages of the system.
+every file but the logs is compared; all that was started is stopped, and that file is taken away again.
 """
 
 import argparse
@@ -24,11 +23,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
 from killed_runs import filmed, hashes
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "sinfo")
 CONFIGURATION = """\
 ClusterName=single
