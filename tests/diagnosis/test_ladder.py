@@ -52,24 +52,6 @@ def fits(pairs):
 
 
 @pytest.mark.slow
-def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits, pairs):
-    table = ladder(fits, ["", DEPLETION])
-    assert table["added"].tolist() == ["", DEPLETION]
-    # Laid on the last model: far off, the first one would make replicates differ by more than they do.
-    assert table["floor_m"].tolist() == [in_sample(fits[1]).floor_m] * 2
-    before, after = (table.iloc[k] for k in range(2))
-    for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
-        assert before[column] > 1.25 * after[column]
-    # The model that the vines were grown with, no number of it fitted.
-    truth = fits[1].model.with_values(damping_values([trial for trial, _ in pairs]) | {f"{DEPLETION}.gamma": 1.4})
-    held = ["eversion_damping.B", "eversion_damping.n", f"{DEPLETION}.gamma", "P_y"]
-    known = in_sample(vt.fit(truth, pairs, fixed=held, profile=False)).rms_m
-    assert after["rms_left_out_m"] < 1.25 * known
-    assert before["excess_left_out_m"] > 1.5 * after["excess_left_out_m"]
-    assert table.attrs["notes"] == []
-
-
-@pytest.mark.slow
 def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs):
     """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
     one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]
@@ -193,19 +175,6 @@ def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
     assert row["change"] > 5 * row["change_sigma"] > 0
 
 
-@pytest.mark.slow
-def test_a_model_without_an_emptying_chamber_fails_by_condition(fits):
-    """n and the yield pressures are free, and take what they can upon themselves."""
-    failing = locate(fits[0])
-    assert failing.fails
-    worst = failing.by_condition.iloc[0]
-    assert worst["rms_m"] == failing.by_condition["rms_m"].max()
-    assert failing.by_condition["z"].max() > 3.5
-    along = failing.along_position
-    assert set(along["condition"]) == set(failing.by_condition["condition"])
-    assert along["n_trials"].max() == failing.by_condition["n_trials"].max()
-
-
 def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
@@ -218,17 +187,6 @@ def test_every_trial_finds_the_b_it_was_grown_with():
         away[vines == vine] -= away[vines == vine].mean()
     assert np.std(away) < 0.005
     assert np.std(values.deviation) > 0.015
-
-
-@pytest.mark.slow
-def test_vines_of_different_exponents_are_told():
-    one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
-    fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
-    assert {told.code for told in drift(fit).remarks} == {"drifts"}
-    (of_n,) = (each for each in differences(fit) if each.name == "n_by_vine")
-    assert of_n.p < 1e-6
-    (split,) = between_fits(fit, [of_n], 0.0, lambda _: None)
-    assert np.ptp([number.value for number in split.numbers]) == pytest.approx(0.07, abs=0.03)
 
 
 @pytest.mark.slow

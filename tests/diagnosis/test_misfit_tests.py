@@ -53,19 +53,6 @@ def seen_crookedly() -> Pairs:
 
 
 @pytest.mark.slow
-def test_a_camera_that_was_moved_between_vines_is_named_with_a_scale_for_each():
-    pairs = pairs_of(campaigns.grown(campaigns.sheet(), 301))
-    eps = [0.03 if trial.diameter_m > 0.02 else 0.0 for trial, _ in pairs]
-    moved = [(t, replace(k, lead_position_m=(1 + e) * k.lead_position_m)) for e, (t, k) in zip(eps, pairs, strict=True)]
-    candidates = ("length_scale", "film_mass", "lens", "reservoir_depletion", "tail_friction")
-    said = vt.diagnose(moved, candidates=candidates, ladder=False, advice=False)
-    assert (said.verdict, said.answer_set) == ("artefact", ("length_scale",))
-    sizes = {number.vine: number for number in said.ranking[0].numbers}
-    for e, (trial, _) in zip(eps, pairs, strict=True):
-        assert abs(sizes[trial.vine].value - e) < 4 * sizes[trial.vine].sigma < 0.02
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
     def none(predictor, solution) -> systematics.Systematics:

@@ -78,14 +78,6 @@ def test_detectable_sizes_follow_the_normal_distribution_and_small_effects_linea
     assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
 
 
-@pytest.mark.slow
-def test_four_times_the_trials_halve_the_detectable_size(power):
-    # Where scatter of trials alone is in the way, and positions are known as good as exactly.
-    few, many = (power_with(planned(replicates))["leak"].size_at(0.5) for replicates in (4, 16))
-    assert few / many == pytest.approx(2.0, rel=0.25)
-    assert power["leak"].size_at(0.5) > few
-
-
 def test_two_equivalent_effects_are_confused_with_each_other():
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
     power = power_with(planned(2, candidates=("area_scale", "pressure_gain")))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, as_track, filmed, grown_position, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, as_track, filmed, grown_position, vine_trial
 
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
@@ -30,13 +30,6 @@ def trial_fit(name: str, time_s: Floats, position_m: Floats, speed_m_s, release_
         predicted_position_m=model_m, predicted_velocity_m_s=speed_m_s * (since_s > 1e-9), residual_m=off_m,
         whitened=off_m, release_s=release_s, origin_m=origin_m, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
     )  # fmt: skip
-
-
-def grown(name: str, speed: float) -> TrialFit:
-    """A vine that speeds up as 1 − exp(−t / 20 ms) towards 2 m/s times `speed`."""
-    time_s = STEP_S * np.arange(-30, 151)
-    since_s = np.maximum(time_s, 0.0)
-    return trial_fit(name, time_s, 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))), 1.9, 0.0, 0.0)
 
 
 SPEED_M_S = 2.0
@@ -79,21 +72,6 @@ def test_the_band_is_that_of_the_replicates():
     last = table[table["trial"] == "a"].iloc[-1]
     columns = ["model_position_m", "replicates_mean_m", "lead_position_m"]
     assert last[columns].tolist() == pytest.approx([SPEED_M_S * 0.1, SPEED_M_S * 0.1, SPEED_M_S * 0.1 + 1e-3])
-
-
-@pytest.mark.slow
-def test_a_model_that_lacks_nothing_stands_at_the_floor():
-    """Two vines, four pressures, four replicates that scatter; the model is the one they were grown with."""
-    pairs, _ = small_campaign(seed=11, replicates=4)
-    true_model = vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
-    table = true_model.table
-    together = np.sqrt(np.mean(table["rms_position_m"] ** 2) / np.mean(table["replicate_floor_m"] ** 2))
-    assert 0.8 < together < 1.25
-    assert table["ratio"].max() < 2.0
-    assert len(table) == 8
-    assert list(true_model.trajectories) == table["condition"].tolist()
-    # A prediction has a release and an origin of its own and nothing else.
-    assert {(trial.pressure_deviation, trial.damping_deviation) for trial in true_model.trials} == {(0.0, 0.0)}
 
 
 def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model():
