@@ -147,22 +147,6 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
 
 
 @through_snakemake
-def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campaign):
-    rows = read_rows(campaign[0] / "trials.csv")
-    good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
-    assert list(rows) == [*good, "torn", "aside"]
-    assert [rows[name]["status"] for name in rows] == ["ok"] * len(good) + ["failed", "left_out"]
-    truth = [steady_tail_speed(diameter_mm, pressure_kPa) for diameter_mm in B for pressure_kPa in PRESSURES_KPA]
-    assert [float(rows[name]["x_ss_m_s"]) for name in good] == pytest.approx(truth, rel=0.02)
-    for method in ("log_log", "both_axes"):
-        fit = json.loads((campaign[0] / "damping.json").read_text())[method]
-        assert fit["refused"] is None
-        assert fit["n"] == pytest.approx(N, abs=0.01)
-        assert {law["diameter_mm"]: law["B"] for law in fit["vines"].values()} == pytest.approx(B, rel=0.02)
-        assert fit["n_95"][0] < fit["n"] < fit["n_95"][1]
-
-
-@through_snakemake
 def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path):
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")

@@ -8,7 +8,6 @@ import numpy as np
 from by_hand import followed
 
 from vinetrack.core.records import Track, Trial, plain_track
-from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.tracks.position_noise import ar1_noise
@@ -45,12 +44,6 @@ def grown_position(trial: Trial, time_s, B: float, n=N_TRUE, pressure_gain=1.0, 
 
 def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray | None = None) -> Track:
     return plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
-
-
-def fallen_m(time_s: np.ndarray, trial: Trial, drag: float) -> np.ndarray:
-    """Of a ball in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D))."""
-    terminal_m_s = math.sqrt(2 * trial.payload_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag))
-    return terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0.0) / terminal_m_s))
 
 
 def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[Track, float, float]:

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, N_TRUE, as_track, fallen_m, filmed, small_campaign, vine_trial
+from hidden.balls import fallen
+from lsoda_vine import B_TRUE, N_TRUE, as_track, filmed, small_campaign, vine_trial
 from scipy.stats import t as student
 
 import vinetrack as vt
@@ -100,7 +101,7 @@ def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[T
     trial = Trial(name=name, diameter_m=0.1, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=20e-3, travel_ratio=1.0)
     time_s = np.arange(100) / 120
     noise = np.random.default_rng(seed).normal(0, noise_m, time_s.size)
-    return trial, as_track(time_s, fallen_m(time_s, trial, drag) + noise)
+    return trial, as_track(time_s, fallen(time_s, 20e-3, 0.1, drag) + noise)
 
 
 def scattering(seed: int, campaign: int, count: int) -> Pairs:

@@ -7,12 +7,10 @@ import av
 import cv2
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
-from scipy.special import erf
 
-from vinetrack.laboratory.filming import render_recording, render_target
+from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.render import FrameRenderer
-from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Target, Tube, preset
+from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Tube, preset
 
 FPS = 1000.0
 CLEAN = preset("clean")
@@ -210,48 +208,3 @@ def test_h264_holds_every_frame_at_the_rendered_levels_in_the_limited_range(tmp_
     error = frames[10].to_ndarray(format="yuv420p")[:128] - levels
     assert abs(error.mean()) < 0.2
     assert 10 * np.log10(219**2 / (error**2).mean()) > 36
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bit_depth", [8, 16])
-def test_ffv1_loses_nothing(tmp_path, bit_depth):
-    scene = replace(DEMO, sensor=Sensor(bit_depth=bit_depth), encoding=Encoding(codec="ffv1"))
-    film(scene, tmp_path / "trial.mkv")
-    with av.open(str(tmp_path / "trial.mkv")) as container:
-        plane = list(container.decode(video=0))[9].planes[0]
-    levels = np.frombuffer(plane, dtype=np.uint8 if bit_depth == 8 else np.uint16)
-    row = plane.line_size // levels.itemsize
-    assert (levels.reshape(-1, row)[:128, :320] == rendered(scene, 9)).all()
-
-
-CAMERA = Camera(focal_px=1300, k1=-0.25, k2=0.08, tilt_x_deg=7, tilt_y_deg=-9)
-SCENE = replace(preset("demo"), camera=CAMERA, sensor=Sensor(noise=False, fixed_pattern=0, bit_depth=16))
-CHECKER = Target(kind="checkerboard", squares=(11, 4), square_m=0.025, angle_deg=2.0, centre_m=(0.004, -0.003))
-
-
-def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Where two blurred edges cross, by least squares in a window of ±9 px; written apart from the package's own."""
-    found = []
-    for corner in near:
-        x0, y0 = np.rint(corner).astype(int)
-        y, x = np.mgrid[y0 - 9 : y0 + 10, x0 - 9 : x0 + 10]
-        levels = picture[y0 - 9 : y0 + 10, x0 - 9 : x0 + 10] / 65535.0
-
-        def misfit(p, x=x, y=y, levels=levels):
-            a = ((x - p[0]) * np.cos(p[2]) + (y - p[1]) * np.sin(p[2])) / p[4]
-            b = ((x - p[0]) * np.cos(p[3]) + (y - p[1]) * np.sin(p[3])) / p[4]
-            return (p[5] + p[7] * (x - x.mean()) + p[8] * (y - y.mean()) + p[6] * erf(a) * erf(b) - levels).ravel()
-
-        starts = [[*corner, 0.0, np.pi / 2, 1.0, levels.mean(), sign * levels.std(), 0, 0] for sign in (1, -1)]
-        fits = [least_squares(misfit, start, method="lm") for start in starts]
-        found.append(min(fits, key=lambda fit: fit.cost).x[:2])
-    return np.array(found)
-
-
-@pytest.mark.slow
-def test_a_target_hangs_where_it_is_told():
-    target = replace(CHECKER, squares=(11, 3), square_m=0.02)
-    expected = projected(target.corners_m(), CAMERA)
-    off_px = crossings(render_target(target, SCENE), expected) - expected
-    assert np.abs(off_px).max() < 0.03
-    assert np.abs(off_px.mean(axis=0)).max() < 0.01
