@@ -94,11 +94,6 @@ def test_probes_of_nothing_are_heard_as_seldom_as_they_say(trials, probes, scatt
         assert np.mean(heard) > 0.01
 
 
-def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels():
-    draw, sizes = np.random.default_rng(9), [30 / math.sqrt(6), *[0] * 11]
-    assert all(any_probe_exceeds(scores(draw, 6, 12, sizes=sizes), 0.1 * LATER) for _ in range(40))
-
-
 def test_what_one_of_many_probes_feels_alone_is_heard():
     """Six standard errors in one of 24 probes."""
     draw, sizes = np.random.default_rng(20606), np.array([6.0, *[0] * 23]) / math.sqrt(60)

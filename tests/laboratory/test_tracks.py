@@ -8,14 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from by_hand import LOADED, N, followed
-from hidden import laboratories as faults
 from hidden.balls import fallen
-from hidden.laboratory_kinds import BARE
-from hidden.motion import AIR, G, Tube, follow
-from hidden.shots import Laboratory, careful, plan, seen
+from hidden.motion import AIR, G, Tube
 from hidden.slack import follow_slack
 from hidden.verdicts import Answer, Should, judge
-from hidden.visibility import visible_sigma
 
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import base_model
@@ -161,38 +157,6 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path):
         recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
 
 
-SEED = 20_900
-FEW = (18, 24)
-
-
-def drawn() -> tuple[Laboratory, np.random.Generator]:
-    draw = np.random.default_rng(SEED)
-    return careful(plan(draw, replace(BARE, trials=FEW), lambda _: True), draw), draw
-
-
-def test_wear_follows_the_order_of_each_vine():
-    laboratory, draw = drawn()
-    before = faults.in_rising_order(laboratory, draw)
-    after = faults.worn(0.02, 0.02)(before, draw)
-    for vine in {shot.setting.vine for shot in before.shots}:
-        pairs = [(a, b) for a, b in zip(before.shots, after.shots, strict=True) if a.setting.vine == vine]
-        assert [b.physics.B / a.physics.B for a, b in pairs] == pytest.approx([1 + 0.02 * k for k in range(len(pairs))])
-        pressures = [a.setting.pressure_kPa for a, _ in pairs]
-        assert pressures == sorted(pressures)
-
-
-def test_a_row_that_is_read_late_shows_what_was_there_then():
-    laboratory, draw = drawn()
-    shot = laboratory.shots[0]
-    camera = faults.rolling(laboratory, draw).camera
-    since = np.arange(-5, 60) / shot.setting.capture_hz
-    y, _, _ = seen(shot, camera, since)
-    moment = since + camera.row_delay_s_m * (y - camera.lens_centre_m)
-    order = np.argsort(moment)
-    out, _ = follow(moment[order], shot.tube, shot.physics, np.empty((0, 3)))
-    assert y[order] == pytest.approx(out[:, 0], abs=2e-6)
-
-
 @pytest.mark.parametrize("P", [7e3, 14e3, 28e3])
 def test_a_tail_that_cannot_push_moves_as_in_the_package(P):
     trial = LOADED.trial(pressure_Pa=P, tail_slack="free")
@@ -249,13 +213,3 @@ def test_an_answer_is_judged_by_what_is_right_to_say(said, should, right, wrong_
 def test_a_fault_that_hardly_shows_need_not_be_named():
     should = Should(("artefact",), any_of=("lens",), true=("lens",))
     assert [judge(answer("adequate"), should, {"visible_sigma": size}).right for size in (3.0, 30.0)] == [True, False]
-
-
-@pytest.mark.slow
-def test_a_fault_is_as_visible_as_the_noise_lets_it_be():
-    laboratory, draw = drawn()
-    strong = faults.lens(2, 2)(laboratory, draw)
-    # Errors of B and pressure can hide some of it, and noise rules how much of the rest shows.
-    louder = replace(strong, camera=replace(strong.camera, noise_m=4 * strong.camera.noise_m))
-    assert visible_sigma(strong) > 20
-    assert 2 < visible_sigma(strong) / visible_sigma(louder) < 4.4
