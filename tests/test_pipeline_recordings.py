@@ -12,7 +12,6 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
-from commanded import run
 from test_pipeline import read_rows, snakemake
 
 from vinetrack.experiment.folder import read_experiment
@@ -157,16 +156,6 @@ def test_the_report_links_to_strips_and_shows_calibration_and_a_clip_of_every_co
     assert sorted(tracked[name] for name in clips) == sorted(set(tracked.values()))
     assert page.count('src="data:video/mp4;base64,') == 1
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
-
-
-def test_check_says_of_the_same_folder_what_is_wrong(filmed):
-    done = run("check", filmed.results.parents[1] / "vines")
-    assert done.exit_code == 1
-    lines = [line for line in done.output.splitlines() if line.startswith(("error", "warning"))]
-    assert [next(name for name in BAD if f"trial {name}" in line) for line in lines] == [
-        "gone", "beheaded", "letter", "part",
-    ]  # fmt: skip
-    assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
 
 
 @pytest.mark.real
