@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -217,24 +216,3 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     assert json.loads((results / "fit.json").read_text())["refused"].startswith("No trial can be fitted")
     assert {name: (results / name).read_text() for name in MODEL_HEADERS} == MODEL_HEADERS  # and no rows
     assert not list((results / "comparison").iterdir())
-
-
-# A workflow that is killed goes on with the same command.
-@through_snakemake
-def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path):
-    write_campaign(tmp_path / "vines")
-    results = tmp_path / "results" / "vines"
-    command = [
-        sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--workflow-profile",
-        str(ROOT / "profiles" / "default"), "--cores", "1", "results/vines/trials.csv", "--config", "experiment=vines",
-    ]  # fmt: skip
-    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
-    end = time.monotonic() + 60
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **where) as first:
-        while not list((results / "tracks").glob("*.csv")) and time.monotonic() < end:
-            time.sleep(0.05)
-        first.kill()
-    assert not (results / "trials.csv").exists()
-    again = subprocess.run(command, capture_output=True, text=True, check=False, **where)
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert (results / "trials.csv").exists()
