@@ -21,9 +21,7 @@ from by_hand import (
     simulated,
     whole_catalogue,
 )
-from hidden import EFFECTS, OUTSIDERS, make
-from hidden.motion import Physics, Tube, follow
-from hidden.questions import outsider_values, true_effects
+from hidden import EFFECTS
 from hidden.verify import FRAME_S, SIZES, ours, trials
 from numba import njit
 from scipy.integrate import cumulative_trapezoid, solve_ivp
@@ -62,38 +60,6 @@ def test_two_simulators_agree(effect):
         seen = np.isfinite(other)
         assert np.nanmax(other) > 0.2 * trial.length_m
         np.testing.assert_allclose(other[seen], theirs[seen], atol=1e-8)
-
-
-OUTSIDE = {
-    "rough_patch": {"patch_F": 0.8, "patch_y": 0.1, "patch_width": 0.01},
-    "ripple": {"ripple_F": 0.4, "ripple_length": 0.05, "ripple_phase": 1.0},
-    "cubic": {"cubic": 1e-3},
-    "beyond_a_speed": {"beyond": 0.02, "beyond_speed": 2.0},
-    "growing_friction": {"growing_F": 0.8, "growing_s": 0.2},
-    "changed_film": {"step_B": 0.1, "step_y": 0.12},
-    "slip": {"slip_F": 0.8, "slip_x": 0.5, "slip_speed": 1.5},
-    "chirp": {"chirp_F": 0.4, "chirp_length": 0.12, "chirp_phase": 1.0},
-    "squeeze": {"squeeze_F": 0.5, "squeeze_Pa": 2e4, "squeeze_y": 0.1, "squeeze_width": 0.03},
-}
-
-
-@pytest.mark.parametrize("name", OUTSIDERS)
-def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
-    trial = trials()["bare, down"]
-    physics = Physics(B=B, n=N, **OUTSIDE[name])
-    rig = ("pressure_Pa", "yield_pressure_Pa", "diameter_m", "thickness_m", "length_m")
-    tube = Tube(*(getattr(trial, name) for name in rig), 0.0, 1.0)
-    other, _ = follow(TIMES, tube, physics, np.empty((0, 3)))
-    truth = replace(make("null:few_trials", 900).truth, outsider=name, physics=physics)
-    model = (vt.base_model() + true_effects((), name)[0]).with_values(DAMPING | outsider_values(truth))
-    # In one compiled model for all of them.
-    host = vt.Model((*vt.base_model(), *(true_effects((), outsider)[0] for outsider in OUTSIDERS)))
-    theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].lead_position_m
-    seen = other[:, 1] < 0.95 * trial.length_m
-    plain, _ = follow(TIMES, tube, Physics(B=B, n=N), np.empty((0, 3)))
-    assert np.max(np.abs(other[seen, 1] - plain[seen, 1])) > 1e-3
-    # A film that changes from one millimetre to the next is a corner to one integrator and a step to the other.
-    np.testing.assert_allclose(other[seen, 1], theirs[seen], atol=2e-6 if name == "changed_film" else 1e-7)
 
 
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from by_hand import LOADED, N, followed
+from by_hand import followed
 from hidden.balls import fallen
-from hidden.motion import AIR, G, Tube
-from hidden.slack import follow_slack
+from hidden.motion import AIR, G
 from hidden.verdicts import Answer, Should, judge
 
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.model import base_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
@@ -155,17 +153,6 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path):
     assert filmed.settings.calibration.square_mm == pytest.approx(15)
     with pytest.raises(ValueError, match="recordings already"):
         recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
-
-
-@pytest.mark.parametrize("P", [7e3, 14e3, 28e3])
-def test_a_tail_that_cannot_push_moves_as_in_the_package(P):
-    trial = LOADED.trial(pressure_Pa=P, tail_slack="free")
-    tube = Tube(P, LOADED.P_y, LOADED.D, LOADED.t, LOADED.L, payload=LOADED.payload, cosine=1.0)
-    times = np.linspace(0, 0.2, 400)
-    found = follow_slack(times, tube, LOADED.B, N)
-    model = base_model().with_values({"eversion_damping.B": LOADED.B, "eversion_damping.n": N})
-    assert found[-1, 2] > 1e-6
-    assert found[:, 0] == pytest.approx(simulate(model, trial, times).lead_position_m, abs=2e-5)
 
 
 def test_a_ball_falls_as_the_equation_of_motion_has_it():
