@@ -257,16 +257,6 @@ def test_a_model_that_misses_one_trial_by_far_is_not_adequate():
     assert [note.facts["names"] for note in diagnosis.notes if note.code == "far_off"] == [[trial.name]]
 
 
-@pytest.mark.slow
-def test_a_payload_forgotten_in_one_row_is_told_though_the_model_describes_the_others():
-    trials = campaign(isometric_vine(4), (24, 36, 48), 3, payload_g=35.6)
-    pairs = pairs_of(campaigns.grown(trials, 3, values=damping_values(trials)))
-    trial, track = pairs[4]
-    pairs[4] = (replace(trial, payload_kg=0.0), track)
-    diagnosis = vt.diagnose(vt.fit(vt.base_model(), pairs, profile=False), ladder=False, advice=False)
-    assert [note.facts["names"] for note in diagnosis.notes if note.code == "far_off"] == [[trial.name]]
-
-
 def test_a_diagnosis_names_the_trials_of_the_sheet_that_it_could_not_use(monkeypatch):
     pairs, why = pairs_of(campaigns.grown(campaigns.sheet(), 301)), "its trace has another clock"
     monkeypatch.setattr("vinetrack.diagnosis.diagnose.pairs_of", lambda *_: (pairs, {"gone": why}))
