@@ -332,6 +332,16 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
 
 
 @pytest.mark.slow
+def test_another_tube_for_high_pressures_is_named(trials):
+    other = [trial.pressure_Pa >= (38e3 if trial.diameter_m > 0.02 else 50e3) for trial in trials]
+    pairs = made(trials, [1.1 if each else 1.0 for each in other], seed=3)
+    known = [(replace(t, specimen="ab"[each]), track) for (t, track), each in zip(pairs, other, strict=True)]
+    result, _ = diagnosed(known)
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "specimen" in result.answer_set
+
+
+@pytest.mark.slow
 def test_exponents_that_differ_by_vine_are_named(trials):
     pairs: Pairs = []
     for vine, exponent in zip(dict.fromkeys(trial.vine for trial in trials), (0.40, 0.46), strict=True):
