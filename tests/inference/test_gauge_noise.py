@@ -125,6 +125,24 @@ def test_exact_traces_and_one_that_no_curve_explains_do_not_change_the_others():
         assert other.mean_error_Pa == pytest.approx(60.0 * np.sqrt(1.7 / 0.3 / 400), rel=0.4)
 
 
+@pytest.mark.parametrize("per_reading", [3.4, 5.0, 18.0])
+def test_readings_of_an_interpolated_trace_are_recovered(per_reading):
+    draw = np.random.default_rng(3)
+    read_at = np.arange(0.3, 400.0, per_reading)
+    readings_Pa = 20e3 + 100.0 * draw.standard_normal(read_at.size)
+    frames = np.arange(int(read_at[0] + 0.2 * per_reading) + 1, int(read_at[-1] - 0.2 * per_reading))
+    (told,) = gauge.gauge_readings([np.interp(frames, read_at, readings_Pa)])
+    # Those before and after the trace as well, where enough of the lines that lead to them shows.
+    places = told.places + frames[0]
+    which = np.searchsorted(read_at, places - 0.5 * per_reading)
+    assert which.size >= read_at.size - 2
+    np.testing.assert_allclose(places, read_at[which], atol=1e-4)
+    np.testing.assert_allclose(told.values_Pa, readings_Pa[which], rtol=1e-7)
+    (held,) = gauge.gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
+    assert np.isin(held.values_Pa, readings_Pa).all()
+    assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
+
+
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
 @pytest.mark.parametrize("per_reading", [5.0, 40.0])
 def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_reading, digit_Pa):
