@@ -126,7 +126,8 @@ def test_every_room_and_the_tests_stay_within_their_budgets():
         if any(a > b + more for a, b, more in zip(found, BUDGETS[name], LET_PASS, strict=True))
     }
     assert not over, "rooms over their budget of lines, files, constants: take something out"
-    assert sum(path.read_text(encoding="utf-8").count("\n") for path in (ROOT / "tests").rglob("*.py")) <= TESTS
+    lines = sum(path.read_text(encoding="utf-8").count("\n") for path in (ROOT / "tests").rglob("*.py"))
+    assert lines <= TESTS + LET_PASS[0]
 
 
 def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_the_laboratory():

@@ -25,7 +25,7 @@ from vinetrack.video import edge, track
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import PointQuality, ending_of, moving_range
+from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Look, cut_strip
 from vinetrack.video.track import Tracking, follow, track_recording
@@ -155,6 +155,14 @@ def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_correct
     assert np.flatnonzero(with_flag(track.flag, "gap")).tolist() == [30]
     assert np.diff(track.time_s[28:32]) == pytest.approx([1e-3, 2e-3, 1e-3])
     np.testing.assert_array_equal(correct_frames(track).time_s, track.time_s)
+
+
+def test_stated_errors_follow_the_roughness():
+    rng = np.random.default_rng(213)
+    noise = rng.normal(0, 0.5, 400)
+    position = 0.02 * np.arange(400.0) ** 2 + noise
+    scaled = calibrated_sigma(position, np.full(400, 0.2))
+    assert scaled.mean() == pytest.approx(0.5, rel=0.15)
 
 
 @pytest.mark.parametrize("flight", [2.0, 1.0])
