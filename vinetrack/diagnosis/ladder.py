@@ -30,7 +30,8 @@ from vinetrack.core.units import number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.fit import aligned_to_trials, fit, fit_subset, predict_prepared, rest_is_seen
+from vinetrack.inference.errors import root_without, trial_information
+from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, fit_subset, predict_prepared, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
@@ -286,9 +287,27 @@ def mean_square(courses: Sequence[ResidualCourse], scatter: Scatter) -> tuple[fl
     return total_m2 / len(courses), degrees, float(np.mean(2 * own_m2**2 / variance_m4))
 
 
-def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
+def parameter_error(aligned: AlignedTrials) -> float:
+    """Mean square by which errors of the parameters, fitted to the other conditions, move the trials of each condition,
+    m²; of trials whose parameters those determine.
+    """
+    solution = aligned.fit.solution
+    information = trial_information(solution)[0]
+    squares = []
+    for condition in aligned.courses:
+        members = [i for i, trial in enumerate(aligned.trials) if trial.trial.condition == condition]
+        if (root := root_without(solution, information, members)) is not None:
+            for i in members:
+                moved_m = design_matrix(solution.columns[i], solution.problem.index[i], len(root)) @ root
+                moved_m = orthogonal_part(moved_m, aligned.columns[i][:, aligned.nuisances(i)])
+                squares.append(np.mean(np.sum(moved_m[first_that_counts(aligned.trials[i]) :] ** 2, axis=1)))
+    return float(np.mean(squares)) if squares else 0.0
+
+
+def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter, further_m2: float = 0.0) -> dict[str, float]:
     """Error of an adequate model over these trials, rms, m, and the ends of its 95 % range; NaN without replicates. As
-    many degrees of freedom as a trial has, so many has every replicate: the range is of F.
+    many degrees of freedom as a trial has, so many has every replicate: the range is of F. `further_m2` is a mean
+    square that adds to that of the trials' scatter.
     """
     from scipy.stats import f as fisher
 
@@ -296,7 +315,7 @@ def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[
         return dict.fromkeys(EXPECTED, math.nan)
     mean_m2, degrees, of_trial = mean_square(courses, scatter)
     ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trial)
-    return dict(zip(EXPECTED, (math.sqrt(mean_m2 * part) for part in (1.0, *ends)), strict=True))
+    return dict(zip(EXPECTED, (math.sqrt((mean_m2 + further_m2) * part) for part in (1.0, *ends)), strict=True))
 
 
 # ------------------------------------------------------------------------------
@@ -482,7 +501,8 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     inside = [in_sample(each) for each in fits]
     settled = len(fits) - partial - 1
     floor_m, aligned = inside[settled].floor_m, align_trials(fits[settled])
-    expected = expected_error(list(itertools.chain(*aligned.courses.values())), aligned.scatter)
+    courses = list(itertools.chain(*aligned.courses.values()))
+    expected = expected_error(courses, aligned.scatter, parameter_error(aligned))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
         rows.append(

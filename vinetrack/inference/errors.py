@@ -321,6 +321,17 @@ def _covariance_by_noise(solution: Solution, information: Floats) -> Floats:
     return inverse_of_block(square, np.flatnonzero(problem.free & inside & (np.diag(square) > 0)))
 
 
+def root_without(solution: Solution, information: Floats, trials: Sequence[int]) -> Floats | None:
+    """Root of the covariance of the unknowns by all trials but these; None where those do not determine what these
+    depend on.
+    """
+    kept = np.delete(information, trials, axis=0)
+    by_all, by_others = (np.einsum("nkk->k", each) + solution.problem.prior_precision for each in (information, kept))
+    # 1e-6: part of the information on a parameter that must come from other trials (chosen)
+    lost = solution.problem.free & (by_others < by_all) & (by_others <= 1e-6 * by_all)
+    return None if lost.any() else matrix_root(_covariance_by_noise(solution, kept))
+
+
 def scatter_variances(
     information: Floats, scores: Floats, problem: MixedProblem, plain: Floats, count: int
 ) -> tuple[Floats, Floats]:

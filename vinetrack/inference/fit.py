@@ -26,11 +26,11 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
-from vinetrack.inference.errors import student, trial_information
+from vinetrack.inference.errors import root_without, student, trial_information
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import at_correlation, whiten
-from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
+from vinetrack.inference.marginal_likelihood import FitState, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import (
     CONVERGED_DECREASE,
     MOST_ITERATIONS,
@@ -154,24 +154,14 @@ def _leave_one_out(
     trials do not determine all parameters on which it depends.
     """
     problem, state = solution.problem, solution.state
-    size = problem.prior_mean.size
-    total = information.sum(axis=0) + np.diag(problem.prior_precision)
-    others = total - information[i]
-    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    needed = free[np.diag(information[i])[free] > 0]
-    # 1e-6: part of the information on a parameter that must come from other trials to predict a trial from them
-    # (chosen)
-    if len(scores) < 2 or (np.diag(others)[needed] <= 1e-6 * np.diag(total)[needed]).any():
+    if (root := root_without(solution, information, [i])) is None:
         return None
-    covariance = inverse_of_block(others, free)
     columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
-    design = _design_matrix(columns, problem.index[i], size)
-    shift = covariance @ (scores[i] - scores.mean(axis=0))
+    design = design_matrix(columns, problem.index[i], problem.prior_mean.size) @ root
+    shift = root.T @ (scores[i] - scores.mean(axis=0))
     residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
     own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
-    own_loadings = _deviation_loadings(own_sd, columns, trial_data)
-    loadings = np.column_stack([design @ matrix_root(covariance), own_loadings])
+    loadings = np.column_stack([design, _deviation_loadings(own_sd, columns, trial_data)])
     noise = float(state.variance[i]) / (1 - state.rho**2)
     aligned, random, residual = _with_release_and_origin_fitted(
         loadings, residual, columns[:, :2], trial_data, fit_correlation, state, noise
@@ -179,7 +169,7 @@ def _leave_one_out(
     return residual, np.sum(aligned**2, axis=1) + random
 
 
-def _design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
+def design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
     """Sensitivities of a trial to all free parameters, shape (n_points, size), from the columns of its keys."""
     design = np.zeros((len(columns), size + 1))
     np.add.at(design.T, index, columns[:, N_TRIAL_EFFECTS:-1].T)
@@ -210,7 +200,7 @@ def _loadings_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> t
     matched = np.flatnonzero(places >= 0)
     parameter_covariance[matched, :] = parameter_covariance[:, matched] = 0.0
     parameter_covariance[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
-    design = _design_matrix(columns, layout.index[0], theta.size)
+    design = design_matrix(columns, layout.index[0], theta.size)
     unknown = matched[~np.isfinite(np.diag(fit.covariance)[places[matched]])]
     # 1e-6: part of the travel by which a trial does not depend on a parameter (derived)
     if np.any(np.abs(design[:, unknown]) > 1e-6 * np.ptp(trial_data.lead_position_m)):
