@@ -412,6 +412,8 @@ def read_by_rows(times, out, ratio, end, delay):
     """Replace the positions recorded by an instantaneous shutter by those recorded row by row."""
     # Positions that are still needed must not be replaced yet: later ones at a positive delay, else earlier ones.
     count = times.size
+    # An edge that outruns the rows is never read: then the iteration would leave the motion.
+    latest = 2.0 * abs(delay * out[count - 1, 3])
     for step in range(count):
         i = step if delay > 0 else count - 1 - step
         read = times[i] + delay * out[i, 3]
@@ -420,7 +422,7 @@ def read_by_rows(times, out, ratio, end, delay):
             x, v, offset = motion_at(times, out, ratio, end, i, read)
             seen = x / ratio + offset
             change = (read - times[i] - delay * seen) / max(1.0 - delay * v / ratio, 0.1)
-            read -= change
+            read = min(max(read - change, times[i] - latest), times[i] + latest)
             if abs(change) < 1e-10:
                 break
         out[i, 3] = seen
