@@ -25,7 +25,7 @@ from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
 from vinetrack.results import diagnosis_tables as drawn
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_source_experiment
 
 
 def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path):
@@ -51,6 +51,9 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
         results.fit.write_text(content, encoding="utf-8")
         with pytest.raises(ResultsError, match="delete it and run `vinetrack run` again"):
             read_fit(results)
+    write_json(results.provenance, {})
+    with pytest.raises(ResultsError, match="provenance.json cannot be read"):
+        read_source_experiment(tmp_path)
 
 
 def test_what_a_diagnosis_says_stays_and_a_refused_one_has_no_verdict(tmp_path):

@@ -203,8 +203,8 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
     """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
     from vinetrack.experiment.folder import read_experiment
 
-    provenance = read_json(Results(folder).provenance)
-    path = experiment or Path(str(provenance["experiment"]))
+    with _reading(Results(folder).provenance):
+        path = experiment or Path(str(read_json(Results(folder).provenance)["experiment"]))
     if not path.is_dir():
         raise ResultsError(
             f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
