@@ -147,10 +147,8 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
     model, trials, rates, *rest = design
     like = trials[0]
     made = [replace(like, name=f"a{k}", pressure_Pa=P, pressure_sigma_Pa=0.01 * P) for k, P in enumerate(pressures)]
-    again = linear_power.effect_power(
-        planned_tests(model, trials + made, rates[:1] * len(trials + made), *rest)[0], "leak"
-    )
-    assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
+    again = linear_power.power_of(planned_tests(model, trials + made, rates[:1] * len(trials + made), *rest)[0])
+    assert again["leak"].size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
     fewer = [added for added in further.trials if added["probability"] < further.target]
     assert len(fewer) == len(further.trials) - 2
     assert all(14e3 <= pressure <= 40e3 for pressure in pressures)

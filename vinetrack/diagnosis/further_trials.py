@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
+from vinetrack.diagnosis.linear_power import power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
 from vinetrack.diagnosis.result import EffectPower, FurtherTrials
 from vinetrack.dynamics.simulate import SimulationError
@@ -437,4 +437,4 @@ def _with_pairs(
     """The power for an effect with the first so many of these films made as well, each twice."""
     made = [film for film in films[:count] for _ in range(REPLICATES)]
     with_all = misfit_tests(extended_fit(tests.fit, made), tests.effects, tests.level)
-    return effect_power(with_all, now.effect) or now
+    return next(iter(power_of(with_all, only=now.effect).effects), now)

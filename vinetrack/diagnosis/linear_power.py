@@ -54,7 +54,7 @@ from vinetrack.effects import Effect, EffectError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitError, FitTrial
+from vinetrack.inference.fit_data import FEWEST_POINTS, FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
@@ -127,13 +127,10 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
 
 
 def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> FitTrial:
-    """A trial with the positions of a trajectory, at the points that a fit uses: before the last part of the growth,
-    and not next to its end. Stretches without gaps begin anew behind a gap.
+    """A trial with the positions of a trajectory, at the points that a fit uses: before the last part of the growth.
+    Stretches without gaps begin anew behind a gap.
     """
-    length_m = np.nan_to_num(trial_data.trial.length_m, nan=math.inf)
-    behind_s = trajectory.end_time_s + (FRAMES_BEHIND_END + 1) * trial_data.frame_s
-    behind = (trajectory.status == "ended") & (trajectory.time_s > behind_s)
-    keep = (trajectory.lead_position_m < END_FRACTION * length_m) | behind
+    keep = ~(trajectory.lead_position_m >= END_FRACTION * trial_data.trial.length_m)
     stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
     known = {name: getattr(trial_data, name) for name in ("time_s", "stated_m", "slow_m", "relative_sd")}
     of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
@@ -175,11 +172,6 @@ def power_of(
         model=tests.fit.model.names,
         wary=remark("excess_counted_as_noise") if exceeds_slow_errors(tests.fit) else Remark(),
     )
-
-
-def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
-    """Compute at which sizes the trials of a fit can detect one candidate among all others; None where none can."""
-    return next(iter(power_of(tests, only=name).effects), None)
 
 
 def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
