@@ -44,8 +44,9 @@ _ERRORS = {
 def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     """Root mean square error of position of the initial model and with every effect that was added, on a
     logarithmic axis: in sample; on conditions left out of the fit in turn; and on the left-out highest pressure of
-    each vine. The band holds the error that an adequate model would show in 95 % of such campaigns, in trials whose
-    pressure and B scatter as replicates do: an error in it does not refute a model, nor prove that nothing is missing.
+    each vine. The band holds the error on conditions left out that an adequate model would show in 95 % of such
+    campaigns, in trials whose pressure and B scatter as replicates do: an error in it does not refute a model, nor
+    prove that nothing is missing.
     """
     if not len(ladder):
         return None
