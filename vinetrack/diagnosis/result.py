@@ -256,13 +256,8 @@ class Confounder(JsonRecord):
     high_95: OrNaN
 
 
-ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
-    "adequate",
-    "missing",
-    "ambiguous",
-    "artefact",
-    "unexplained",
-)
+VERDICTS = ("adequate", "missing", "ambiguous", "artefact", "unexplained")
+ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS
 
 REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"  # Status of a candidate
 

@@ -115,8 +115,7 @@ def _calibrated(fit: Fit) -> tuple[float, float]:
     pairs = [_leave_one_out(solution, *known, data[i], i, fit.noise_correlation) for i in range(len(data))]
     predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not predictable:
-        # 1.96: derived: standard normal quantile of 0.975
-        return 0.0, 1.96
+        return 0.0, 1.96  # Standard normal quantile of 0.975 (derived)
     square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
