@@ -128,10 +128,7 @@ def _enlarged(grey: Grey, times: int) -> Grey:
     """The picture, or a larger copy for squares that are only a few pixels wide."""
     import cv2
 
-    if times == 1:
-        return grey
-    size = (grey.shape[1] * times, grey.shape[0] * times)
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC))
+    return np.asarray(cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC))
 
 
 def _in_original(corners_px: NDArray[Any], times: int) -> Floats:

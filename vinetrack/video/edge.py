@@ -104,8 +104,7 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
         strip.values, strip.scale, strip.offset, state.edge, reach, state.lag, early, late, MEMORY_FRAMES,
         state.appearance, clip, state.shading,
     )  # fmt: skip
-    half = len(strip.values) // 2
-    middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
+    middle = float(strip.brightness(np.array([len(strip.values) // 2])).mean())
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
     # too far back, film serves as its own background; without contrast nothing corrects it.
@@ -337,7 +336,11 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
             inside, faint = low <= edge[t] <= high, out[t, 3] < LEAST_FITTED_AMPLITUDE - 1
             if not math.isfinite(previous) or (inside and out[t, 2] <= bad_misfit and not faint):
                 continue
-            replacement = _best_between(strip, state, t, low, high)
+            places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))
+            found = search_edges(strip, state, np.full(len(places), t), places)
+            seen = np.isfinite(found[:, 2]) & (found[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
+            found = found[seen & (found[:, 0] >= low - 0.5) & (found[:, 0] <= high + 0.5)]
+            replacement = found[np.argmin(found[:, 2])] if len(found) else None
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
             ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
@@ -352,15 +355,6 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
                 out[t] = replacement
             edge[t] = float(out[t, 0])
     return out
-
-
-def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float) -> Floats | None:
-    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
-    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))
-    fits = search_edges(strip, state, np.full(len(places), t), places)
-    inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
-    inside &= np.isfinite(fits[:, 2])
-    return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
 
 
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
@@ -473,57 +467,34 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 
 def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
-    film and background for a straight tip and a typical blur; and first column passed, and the one behind the last.
+    film and background for a straight tip and a typical blur; and the first column of those that changed in runs, and
+    the one behind the last. A late beginning is better than an early one: neighbours then stand in for the background.
     """
-    ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
-    last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
+    five = np.minimum(np.arange(5), len(strip.values) - 1)
+    last, first = (ky.median_of_five(strip.brightness(frames)) for frames in (-1 - five, five))
     # Power of each column's change, of rows averaged in groups, over that of the noise
     # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
     group_size = int(np.clip(len(first) // 12, 1, 4))
     grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
     power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
-    # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
+    # Deviations count in units of a pixel's own change, so that all that change have the same vote
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
-    weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
-    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
-    votes = [((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks]
-    path, passed = _trim_to_changed_runs(ky.dividing_path(np.stack(votes)), power)
-    blank = np.zeros((4, *first.shape), np.float32)
-    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, blank)
-    return estimate_appearance(strip, state, 0.0), passed
-
-
-def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
-    """Clip a path to the range of columns that changed in runs; prepend a run-up. A late beginning is better than an
-    early one: neighbours then stand in for the background, whereas a column that never changed carries no information
-    about the edge.
-    """
+    variance = ((last - first) ** 2 + (4.0 * strip.noise) ** 2) / kernels.EVIDENCE_CLIP**2
+    looks = np.stack([last, first, variance, variance]).astype(np.float32)
+    votes = kernels.film_evidence(strip.values, strip.scale, strip.offset, looks, 0.0)
+    path = ky.dividing_path(votes)
     # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
     # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
-    strong = change > 70.0
-    run = np.convolve(strong, np.ones(9) / 9, mode="same") > 0.6
+    run = np.convolve(power > 70.0, np.ones(9) / 9, mode="same") > 0.6
     if run.sum() < 9:
         raise ValueError("nothing moves along the axis")
-    changed_columns = np.flatnonzero(run & strong)
+    changed_columns = np.flatnonzero(run & (power > 70.0))
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    # A run-up: the beginning is replaced by steps that decrease going back in time, as from rest. An object such as a
-    # door may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
-    # columns in between turn out to be film from the start, and the second path corrects this.
     path = np.clip(path, *passed)
-    steps = np.diff(path)
-    onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
-    later = path[onset + 1 :]
-    if onset < 2 or len(later) < 5:
-        return path, passed
-    # 0.1, 0.2: minimum decrease from step to step of the run-up, going back in time (chosen)
-    fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
-    step = float(np.median(np.diff(later[:4])))
-    for t in range(onset, -1, -1):
-        step = max(step - fall, 0.0)
-        path[t] = max(path[t + 1] - step, 0.0)
-    return path, passed
+    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, looks)
+    return estimate_appearance(strip, state, 0.0), passed
 
 
 class EdgeTracker(Tracker):
@@ -538,9 +509,7 @@ class EdgeTracker(Tracker):
         state, path, passed, exposure_frames = tube.state, tube.state.edge, tube.passed, look.exposure_frames
         exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
         for iteration in range(3):
-            contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
-            width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
-            before, path = path, _path_by_appearance(strip, state.appearance, width, passed)
+            before, path = path, _path_by_appearance(strip, state.appearance, passed)
             # 1.0: two paths are the same if they nowhere differ by more than this (derived)
             if iteration > 0 and np.abs(before - path).max() <= 1.0:
                 break
@@ -713,13 +682,14 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
     return curve, float(np.abs(offsets).max())
 
 
-def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], width: float, passed: tuple[int, int]) -> Floats:
+def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int]) -> Floats:
     """Find the monotone path that best divides film from background between the columns that it passes. Distances from
-    either, in standard deviations of a pixel and of `width` together, are clipped, so that a door, a payload flying
-    ahead or a reflection cannot capture it.
+    either, in standard deviations of a pixel and a tenth of the contrast together, are clipped, so that a door, a
+    payload flying ahead or a reflection cannot capture it.
     """
-    # 2.5: standard deviations at which the difference of a pixel from film or background is clipped (chosen)
-    evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width, 2.5)
+    contrast = np.abs(appearance[0] - appearance[1])[:, passed[0] : passed[1]]
+    width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
+    evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width)
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
     return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
