@@ -477,11 +477,11 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     group_size = int(np.clip(len(first) // 12, 1, 4))
     grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
     power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
-    # Deviations count in units of a pixel's own change, so that all that change have the same vote
+    # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
-    variance = ((last - first) ** 2 + (4.0 * strip.noise) ** 2) / kernels.EVIDENCE_CLIP**2
-    looks = np.stack([last, first, variance, variance]).astype(np.float32)
-    votes = kernels.film_evidence(strip.values, strip.scale, strip.offset, looks, 0.0)
+    weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
+    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
+    votes = np.stack([((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks])
     path = ky.dividing_path(votes)
     # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
     # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
@@ -492,9 +492,29 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    path = np.clip(path, *passed)
-    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, looks)
+    path = _with_run_up(np.clip(path, *passed))
+    blank = np.zeros((4, *first.shape), np.float32)
+    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, blank)
     return estimate_appearance(strip, state, 0.0), passed
+
+
+def _with_run_up(path: Floats) -> Floats:
+    """The path with its beginning replaced by steps that decrease going back in time, as from rest. An object such as a
+    door may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
+    columns in between turn out to be film from the start, and the second path corrects this.
+    """
+    steps = np.diff(path)
+    onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
+    later = path[onset + 1 :]
+    if onset < 2 or len(later) < 5:
+        return path
+    # 0.1, 0.2: minimum decrease from step to step of the run-up, going back in time (chosen)
+    fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
+    step = float(np.median(np.diff(later[:4])))
+    for t in range(onset, -1, -1):
+        step = max(step - fall, 0.0)
+        path[t] = max(path[t + 1] - step, 0.0)
+    return path
 
 
 class EdgeTracker(Tracker):
