@@ -470,8 +470,8 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     film and background for a straight tip and a typical blur; and the first column of those that changed in runs, and
     the one behind the last. A late beginning is better than an early one: neighbours then stand in for the background.
     """
-    five = np.minimum(np.arange(5), len(strip.values) - 1)
-    last, first = (ky.median_of_five(strip.brightness(frames)) for frames in (-1 - five, five))
+    ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
+    last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
     # Power of each column's change, of rows averaged in groups, over that of the noise
     # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
     group_size = int(np.clip(len(first) // 12, 1, 4))

@@ -38,11 +38,10 @@ class Strip:
     axis: Axis
     stabilised: bool
 
-    def brightness(self, frames: slice | Indices = slice(None), columns: slice | Indices = slice(None)) -> Picture:
-        """Grey levels of 255, free of flicker, of some frames and columns, shape (n_frames, n_across, n_columns)."""
-        values = self.values[frames][:, :, columns].astype(np.float32)
-        values *= self.scale[frames, None, None].astype(np.float32)
-        return np.asarray(values + self.offset[frames, None, None].astype(np.float32))
+    def brightness(self, frames: slice | Indices = slice(None)) -> Picture:
+        """Grey levels of 255, free of flicker, of some frames, shape (n_frames, n_across, n_along)."""
+        scale, offset = (of_frame[frames, None, None].astype(np.float32) for of_frame in (self.scale, self.offset))
+        return np.asarray(self.values[frames] * scale + offset)
 
     def shake_along(self, edge_px: Floats) -> Floats:
         """How far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →

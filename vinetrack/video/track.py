@@ -18,7 +18,7 @@ from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.edge import EdgeTracker
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.kymograph import column_after_leap, dividing_path, median_of_five
+from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
     LOST_SIGMA_PX,
     Ending,
@@ -45,7 +45,7 @@ class ArrivalTracker(Tracker):
         strip = cut_strip(look.luma, look.axis, width_px)
         min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
         values = strip.brightness()
-        first = median_of_five(values[np.minimum(np.arange(5), len(values) - 1)])
+        first = np.median(values[:END_FRAMES], axis=0)
         # 4.0: change, in units of the noise, that counts (chosen)
         threshold = 4.0 * max(strip.noise, 3.0)
         changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
