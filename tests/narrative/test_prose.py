@@ -56,6 +56,16 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code():
     assert [code for code in templates() if not re.search(rf"""["']{code}["']""", source)] == []
 
 
+def test_a_size_that_is_named_though_implausible_is_said_to_be_so_beside_it():
+    told, reason = Diagnosis.from_json(diagnosis("missing")), remark("at_bound", title="γ", key="γ", bound=2.4)
+    first = replace(told.rounds[0], ranking=(replace(told.ranking[0], plausible=False, reason=reason),))
+    notes = [
+        next(row.note for row in verdict_table(one) if row.question == "How large")
+        for one in (told, replace(told, rounds=(first, *told.rounds[1:])))
+    ]
+    assert notes[1] == f"{reason}; {notes[0]}"
+
+
 def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:
     sizes = tuple(float(size) for size in at_half * np.linspace(0.5, 1.5, len(PROBABILITIES)))
     return EffectPower(name, "physical", f"{name}.size", symbol, "1", 0.0, 0.0, largest, sizes, {"inlet_loss": 0.26})

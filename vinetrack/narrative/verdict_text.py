@@ -218,7 +218,11 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers and not diagnosis.effects]
     sizes = [f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]]
     answer = "; ".join(filter(None, (", ".join(map(split_estimate, beyond)), *sizes)))
-    return answer, "; ".join([*wider, *_shared_remedies(beyond)])
+    # Believed for want of a hypothesis with a plausible size
+    implausible = [
+        str(row.reason) for step in diagnosis.rounds for row in step.ranking if row.in_answer_set and not row.plausible
+    ]
+    return answer, "; ".join([*implausible, *wider, *_shared_remedies(beyond)])
 
 
 def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
