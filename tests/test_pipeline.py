@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -146,6 +147,22 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
 
 
 @through_snakemake
+def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campaign):
+    rows = read_rows(campaign[0] / "trials.csv")
+    good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
+    assert list(rows) == [*good, "torn", "aside"]
+    assert [rows[name]["status"] for name in rows] == ["ok"] * len(good) + ["failed", "left_out"]
+    truth = [steady_tail_speed(diameter_mm, pressure_kPa) for diameter_mm in B for pressure_kPa in PRESSURES_KPA]
+    assert [float(rows[name]["x_ss_m_s"]) for name in good] == pytest.approx(truth, rel=0.02)
+    for method in ("log_log", "both_axes"):
+        fit = json.loads((campaign[0] / "damping.json").read_text())[method]
+        assert fit["refused"] is None
+        assert fit["n"] == pytest.approx(N, abs=0.01)
+        assert {law["diameter_mm"]: law["B"] for law in fit["vines"].values()} == pytest.approx(B, rel=0.02)
+        assert fit["n_95"][0] < fit["n"] < fit["n_95"][1]
+
+
+@through_snakemake
 def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path):
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")
@@ -216,3 +233,24 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     assert json.loads((results / "fit.json").read_text())["refused"].startswith("No trial can be fitted")
     assert {name: (results / name).read_text() for name in MODEL_HEADERS} == MODEL_HEADERS  # and no rows
     assert not list((results / "comparison").iterdir())
+
+
+# A workflow that is killed goes on with the same command.
+@through_snakemake
+def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path):
+    write_campaign(tmp_path / "vines")
+    results = tmp_path / "results" / "vines"
+    command = [
+        sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--workflow-profile",
+        str(ROOT / "profiles" / "default"), "--cores", "1", "results/vines/trials.csv", "--config", "experiment=vines",
+    ]  # fmt: skip
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
+    end = time.monotonic() + 60
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **where) as first:
+        while not list((results / "tracks").glob("*.csv")) and time.monotonic() < end:
+            time.sleep(0.05)
+        first.kill()
+    assert not (results / "trials.csv").exists()
+    again = subprocess.run(command, capture_output=True, text=True, check=False, **where)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert (results / "trials.csv").exists()

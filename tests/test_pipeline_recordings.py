@@ -12,6 +12,7 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
+from commanded import fit_law, run, succeed
 from test_pipeline import read_rows, snakemake
 
 from vinetrack.experiment.folder import read_experiment
@@ -35,7 +36,8 @@ NATURE = GroundTruth(
     damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
 )  # fmt: skip
 TARGET = Target(squares=(14, 5), square_m=0.015, marker_m=0.011)
-M_PER_PX = 2.4e-4
+WARPED = Camera(m_per_px=2.4e-4, k1=-0.08, tilt_y_deg=0.8)
+PLAIN = Camera(m_per_px=2.4e-4)
 GOOD = {"p30": 30, "p36": 36, "p42": 42}
 BAD = ("part", "beheaded", "letter", "gone")
 
@@ -55,11 +57,11 @@ def write_sheet(folder: Path, pressures_kPa: dict[str, int], settings: str) -> N
     (folder / "experiment.yaml").write_text(SHARED + settings)
 
 
-def film_all(folder: Path, pressures_kPa: dict[str, int]) -> dict[str, Truth]:
+def film_all(folder: Path, pressures_kPa: dict[str, int], camera: Camera) -> dict[str, Truth]:
     """Grow and film trials of these pressures into an experiment folder; the truth of each."""
     (folder / "videos").mkdir(parents=True)
     write_sheet(folder, pressures_kPa, BOARD)
-    filming = Filming(camera=Camera(m_per_px=M_PER_PX, k1=-0.08, tilt_y_deg=0.8), target=TARGET)
+    filming = Filming(camera=camera, target=TARGET)
     picture_target(filming, folder / "calibration" / "board.png", seed=5)
     grown = grow(read_experiment(folder, strict=True).trials, NATURE)
     return {trial.stated.name: film(trial, filming, trial.stated.video, 40 + i) for i, trial in enumerate(grown)}
@@ -82,7 +84,7 @@ def add_bad_ones(videos: Path) -> None:
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("filmed")
-    truth = film_all(workdir / "vines", GOOD)
+    truth = film_all(workdir / "vines", GOOD, WARPED)
     add_bad_ones(workdir / "vines" / "videos")
     write_sheet(workdir / "vines", GOOD | dict.fromkeys(BAD, 36), BOARD + FEW)
     few = ("damping={resamples: 200}", "figures={formats: [svg]}")
@@ -98,11 +100,11 @@ def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
     """
     track = pd.read_csv(results / "tracks" / f"{name}.csv")
     true_m = truth.lead_position_m[: len(track)]
-    moving = (np.gradient(true_m) > 0.05 * M_PER_PX) & (true_m - true_m[0] > 0.5 * M_PER_PX)
+    moving = (np.gradient(true_m) > 0.05 * PLAIN.m_per_px) & (true_m - true_m[0] > 0.5 * PLAIN.m_per_px)
     error_m = (track["lead_position_m"].to_numpy() - true_m)[moving]
     assert np.isfinite(error_m).all(), "a moving frame is lost"
     stated_m = np.hypot(track["lead_position_sigma_m"], track["lead_position_systematic_m"]).to_numpy()[moving]
-    return np.column_stack([error_m - np.median(error_m), stated_m]) / M_PER_PX
+    return np.column_stack([error_m - np.median(error_m), stated_m]) / PLAIN.m_per_px
 
 
 def spread_px(found: np.ndarray) -> float:
@@ -123,7 +125,7 @@ def test_a_good_recording_is_right_within_a_third_of_a_pixel(filmed, name):
     assert (np.abs(found[:, 0]) < 6 * found[:, 1]).all()
     track = pd.read_csv(filmed.results / "tracks" / f"{name}.csv")
     stated_m = np.hypot(track["lead_position_sigma_m"], track["lead_position_systematic_m"]).to_numpy()
-    sure = np.isfinite(track["lead_position_m"].to_numpy()) & (stated_m < 0.5 * M_PER_PX)
+    sure = np.isfinite(track["lead_position_m"].to_numpy()) & (stated_m < 0.5 * PLAIN.m_per_px)
     assert sure.mean() > 0.5  # not where a door may hide the tip, which says so
     slope = np.polyfit(filmed.truth[name].lead_position_m[sure], track["lead_position_m"][sure], 1)[0]
     assert slope == pytest.approx(1, abs=1e-3)
@@ -156,6 +158,35 @@ def test_the_report_links_to_strips_and_shows_calibration_and_a_clip_of_every_co
     assert sorted(tracked[name] for name in clips) == sorted(set(tracked.values()))
     assert page.count('src="data:video/mp4;base64,') == 1
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
+
+
+def test_check_says_of_the_same_folder_what_is_wrong(filmed):
+    done = run("check", filmed.results.parents[1] / "vines")
+    assert done.exit_code == 1
+    lines = [line for line in done.output.splitlines() if line.startswith(("error", "warning"))]
+    assert [next(name for name in BAD if f"trial {name}" in line) for line in lines] == [
+        "gone", "beheaded", "letter", "part",
+    ]  # fmt: skip
+    assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
+
+
+def test_a_scale_that_is_given_serves_as_well(tmp_path):
+    """Through a camera without distortion or tilt, for scales that know of neither."""
+    folder = tmp_path / "vine"
+    truth = film_all(folder, {"p36": 36}, PLAIN)["p36"]
+    two_points = "{kind: two_points, from_px: [100, 60], to_px: [600, 60], length_mm: 120}"
+    for settings, rel_sigma in (
+        (f"calibration: {two_points}\n", 0.5 * 2**0.5 / 500),
+        ("calibration: {kind: mm_per_px, mm_per_px: 0.24}\n", np.nan),
+        ("mm_per_px: 0.24\n", np.nan),
+    ):
+        write_sheet(folder, {"p36": 36}, settings)
+        succeed("trials", folder, tmp_path)
+        fit_law(folder, tmp_path)
+        row = read_rows(tmp_path / "trials.csv")["p36"]
+        assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
+        assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
+        assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
 
 
 @pytest.mark.real

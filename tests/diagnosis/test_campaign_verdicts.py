@@ -10,12 +10,12 @@ import grown as campaigns
 import numpy as np
 import pytest
 from grown import Pairs
-from hidden import shots
+from hidden import make, shots
 from hidden.balls import fallen
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 from hidden_truth import grown, sheet
-from lsoda_vine import small_campaign
+from lsoda_vine import as_track, small_campaign
 from own_effect import NAME, write_effect
 from tube.folder import write_folder
 from tube.models import fit_tubes, models, threshold_kPa
@@ -56,6 +56,32 @@ def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more:
 def row_of(said: result.Diagnosis, effect: str) -> result.Candidate:
     (row,) = (row for row in said.rounds[0].ranking if row.effect == effect)
     return row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "seed", "verdicts"),
+    [
+        ("null:mixed_noise", 908, {"adequate"}),
+        ("null:large_B_scatter", 913, {"adequate"}),
+        ("tail_friction", 918, {"missing", "ambiguous"}),
+        ("reservoir_depletion", 905, {"missing", "ambiguous"}),
+        ("outsider:rough_patch", 962, {"unexplained"}),
+    ],
+)
+def test_what_is_missing_is_in_the_answer_with_its_size_and_nothing_where_nothing_is(kind, seed, verdicts):
+    """Where something is, each condition once. The rough patch is in no catalogue."""
+    hidden = make(kind, seed, trials=int(not kind.startswith("null")))
+    said = diagnosed(list(hidden.pairs))
+    assert said.verdict in verdicts
+    if "missing" not in verdicts:
+        assert said.effects == said.answer_set == ()
+        return
+    assert kind in said.answer_set
+    assert len(said.answer_set) <= 2
+    numbers = {number.key: number for number in row_of(said, kind).numbers}
+    for key, size in hidden.truth.values.items():
+        assert abs(numbers[key].value - size) < 4 * numbers[key].sigma
 
 
 FILM = catalogue()["film_mass"]
@@ -162,6 +188,18 @@ def test_a_scale_or_a_rate_that_is_off_for_the_recordings_of_one_vine_is_named_w
     sizes = {f"{last:g}mm" in number.vine: number for number in row_of(said, effect).numbers}
     assert abs(sizes[False].value) < 3 * sizes[False].sigma
     assert abs(sizes[True].value - (of_time * of_length - 1)) < 3 * sizes[True].sigma < 0.015
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("row", "seed"), [("chamber_larger", 914), ("chamber_smaller", 902)])
+def test_a_chamber_that_was_misread_is_a_depletion(tmp_path, row, seed):
+    """With a γ that no gas has, and nothing else."""
+    rivals = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
+    said = diagnosed(laboratory(tmp_path, row, seed, (10, 14), weighed=False)[1], rivals)
+    assert said.effects == ("reservoir_depletion",)
+    assert said.final_verdict == "adequate"
+    (gamma,) = [number for number in said.parameters if number.key == "reservoir_depletion.gamma"]
+    assert gamma.value < 1.0 if row == "chamber_larger" else gamma.value > 1.4
 
 
 @pytest.mark.slow
@@ -283,6 +321,22 @@ def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_s
     assert "static_yield" in blind
 
 
+@pytest.mark.slow
+def test_a_size_well_beyond_what_could_hide_would_have_been_seen():
+    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
+
+    def asked(**hidden: float) -> Diagnosis:
+        values = {f"tail_friction.{name}": size for name, size in hidden.items()}
+        pairs = grown(values, seed=7000, trials=sheet()[::2])
+        known = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
+        return vt.diagnose(known, candidates=FEW, ladder=False, advice=False)
+
+    largest = next(one.largest for one in asked().rounds[0].ranking if one.effect == "tail_friction")
+    found = asked(mu_w=4 * largest["tail_friction.mu_w"])
+    assert found.verdict in ("missing", "ambiguous")
+    assert "tail_friction" in found.answer_set
+
+
 def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     assert (depleted.verdict, depleted.final_verdict) == ("missing", "adequate")
     assert depleted.effects == depleted.answer_set == ("reservoir_depletion",)
@@ -401,6 +455,27 @@ def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
+def test_the_drag_of_falling_balls_is_named(model):
+    """And nothing that only a tube can have."""
+    balls, time_s = [], np.arange(100) / 120
+    for kind, size in enumerate(((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))):
+        for repeat in range(3):
+            trial = of_ball(f"d{kind}_{repeat}", *size)
+            noise_m = np.random.default_rng(20100 + 10 * kind + repeat).normal(0, 2e-3, time_s.size)
+            grown_m = fallen(time_s - 0.0513, trial.payload_kg, trial.diameter_m, DRAG)
+            balls.append((trial, as_track(time_s, grown_m + 0.004 + noise_m)))
+    found = vt.diagnose(balls, model=vt.make_model(model), ladder=False, advice=False)
+    assert (found.verdict, found.effects) == ("missing", ("air_drag",))
+    drag = found.fits[-1]["C_D"]
+    assert drag.low < DRAG < drag.high
+    assert drag.sigma < 0.03 * DRAG
+    assert align_trials(found.fits[0]).scatter.multiple == 1.0  # no pressure or B of theirs can scatter
+    untried = {row.effect for row in found.rounds[0].ranking if row.status == "not testable here"}
+    assert untried >= TUBES_ALONE
+
+
+@pytest.mark.slow
 def test_vines_that_a_wall_stops_half_way_lack_nothing():
     draw, stopped = np.random.default_rng(1), []
     for trial, track in small_campaign(3)[0]:
@@ -420,15 +495,13 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
     drops = []
     for seed in (10, 11):
         trial, noise_m = of_ball(f"d{seed}", 0.074, 0.145), np.random.default_rng(seed).normal(0, 5e-3, 68)
-        y = fallen(time_s, 0.145, 0.074, DRAG)
+        y = fallen(time_s, trial.payload_kg, trial.diameter_m, DRAG)
         seen, part = y < 47, 2 * y / 47 - 1
         lens_m = 0.018 * (part**3 - 0.6 * part) + 0.01 * (part**2 - 1)
         drops.append((trial, plain_track(time_s[seen], (y + lens_m + noise_m)[seen])))
     found = vt.diagnose(drops, model=vt.make_model(model), ladder=False, advice=False)
     assert found.verdict == verdict
-    assert abs(found.fits[-1]["C_D"].value - DRAG) < 3 * found.fits[-1]["C_D"].sigma
-    assert align_trials(found.fits[0]).scatter.multiple == 1.0  # no pressure or B of theirs can scatter
-    assert {row.effect for row in found.rounds[0].ranking if row.status == NOT_TESTABLE} >= TUBES_ALONE
+    assert abs(found.fits[-1]["C_D"].value - 0.5) < 3 * found.fits[-1]["C_D"].sigma
 
 
 @pytest.mark.real

@@ -52,6 +52,24 @@ def fits(pairs):
 
 
 @pytest.mark.slow
+def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits, pairs):
+    table = ladder(fits, ["", DEPLETION])
+    assert table["added"].tolist() == ["", DEPLETION]
+    # Laid on the last model: far off, the first one would make replicates differ by more than they do.
+    assert table["floor_m"].tolist() == [in_sample(fits[1]).floor_m] * 2
+    before, after = (table.iloc[k] for k in range(2))
+    for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
+        assert before[column] > 1.25 * after[column]
+    # The model that the vines were grown with, no number of it fitted.
+    truth = fits[1].model.with_values(damping_values([trial for trial, _ in pairs]) | {f"{DEPLETION}.gamma": 1.4})
+    held = ["eversion_damping.B", "eversion_damping.n", f"{DEPLETION}.gamma", "P_y"]
+    known = in_sample(vt.fit(truth, pairs, fixed=held, profile=False)).rms_m
+    assert after["rms_left_out_m"] < 1.25 * known
+    assert before["excess_left_out_m"] > 1.5 * after["excess_left_out_m"]
+    assert table.attrs["notes"] == []
+
+
+@pytest.mark.slow
 def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs):
     """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
     one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]

@@ -264,6 +264,17 @@ def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path):
+    pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
+    proposal = propose(vt.base_model(), pairs, lambda _: None)
+    best = proposal.tied[0]
+    assert best.effect.name == "proposed_time"
+    rate = next(number for number in best.ratio.fit.numbers if number.key == "proposed_time.k")
+    assert rate.low < -0.3 / 0.2 < rate.high
+    assert best.rms_left_out_m < proposal.rms_left_out_m
+
+
+@pytest.mark.slow
 def test_nothing_is_proposed_where_nothing_is_missing():
     proposal = propose(vt.base_model(), pairs_of(grown(sheet((4,)), 102)), lambda _: None)
     assert not proposal.tied

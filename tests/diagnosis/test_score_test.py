@@ -94,6 +94,11 @@ def test_probes_of_nothing_are_heard_as_seldom_as_they_say(trials, probes, scatt
         assert np.mean(heard) > 0.01
 
 
+def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels():
+    draw, sizes = np.random.default_rng(9), [30 / math.sqrt(6), *[0] * 11]
+    assert all(any_probe_exceeds(scores(draw, 6, 12, sizes=sizes), 0.1 * LATER) for _ in range(40))
+
+
 def test_what_one_of_many_probes_feels_alone_is_heard():
     """Six standard errors in one of 24 probes."""
     draw, sizes = np.random.default_rng(20606), np.array([6.0, *[0] * 23]) / math.sqrt(60)
@@ -237,6 +242,11 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     assert found.inflation == pytest.approx(inflation)
 
 
+SIZES = (1,) * 12 + (30, 6)
+NAMES = [f"effect_{k}" for k, size in enumerate(SIZES) for _ in range(size)]
+SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
+
+
 @pytest.mark.parametrize(
     ("cosines", "names", "level", "sign", "share"),
     [
@@ -251,6 +261,26 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
 def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
     family = misfit_tests.family_test(cosines, [sign] * len(names), list(names), level)
     assert family["a"] == pytest.approx(norm.isf(share), abs=0.01)
+
+
+@pytest.mark.slow
+def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_share():
+    """Against two million draws from another generator; the shapes of one effect are alike."""
+    draw, level = np.random.default_rng(20620), 3e-3
+    own = draw.standard_normal((len(SIZES), 40))[np.repeat(range(len(SIZES)), SIZES)]
+    cosines = np.corrcoef(own + draw.standard_normal((len(NAMES), 40)))
+    family = misfit_tests.family_test(cosines, SIGNS, NAMES, level)
+    limits, signs = np.array([family[name] for name in NAMES]), np.array(SIGNS)
+    draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
+    alarms, total, by_many = 0, 0, 0  # by_many: by the candidate of thirty shapes
+    for _ in range(40):
+        z = draw.standard_normal((50_000, len(NAMES))) @ root.T
+        beyond = np.where(signs == 0, np.abs(z), z * signs) > limits
+        alarms, total = alarms + int(beyond.any(axis=1).sum()), total + len(z)
+        by_many += int(beyond[:, [name == "effect_12" for name in NAMES]].any(axis=1).sum())
+    assert 0.6 * level < alarms / total < 1.1 * level
+    assert 0.5 < by_many / total / (level / len(set(NAMES))) < 2.0
+    assert family["effect_12"] > family["effect_1"] + 0.4
 
 
 def test_an_implausible_size_is_believed_where_no_other_is_plausible():

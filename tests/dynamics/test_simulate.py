@@ -13,7 +13,7 @@ import vinetrack as vt
 from vinetrack import effects
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics import kernel as batch
-from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, motion_since
+from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, evaluate, motion_since
 from vinetrack.dynamics.model import check_needs, effects_on, host_for, shared_host, stated
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue, load_effect, own_effects
@@ -228,6 +228,18 @@ def test_effects_of_size_zero_and_replaced_ones_do_not_act():
     acting = dict(zip(model.names, effects_on(model, rows).T.tolist(), strict=True))
     always = {name: [True, True] for name in (*BASE_EFFECTS, "supply_refill")}
     assert acting == {**always, "air_drag": [True, False], "reservoir_depletion": [False, False]}
+
+
+def test_terms_along_a_motion_by_hand():
+    model = vt.base_model().with_values({"eversion_damping.B": 6.44})
+    terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
+    mass = 1200 * math.pi * 0.024 * 200e-6 * (0.28 - 0.1) + 0.0356
+    area = math.pi * 0.012**2
+    tip = {"pressure_drive": 28e3 * area, "eversion_damping": -6.44 * 4**0.37, "yield_pressure": -3e3 * area}
+    assert terms.state.moving_mass[0] == pytest.approx(mass, rel=1e-12)
+    assert {name: force[0] for name, force in terms.tip_N.items()} == pytest.approx(tip, rel=1e-12)
+    assert terms.tension_N[0] == pytest.approx(sum(tip.values()) / 2, rel=1e-12)
+    assert terms.acceleration_m_s2[0] == pytest.approx((sum(tip.values()) / 2 + mass * 9.81) / mass, rel=1e-12)
 
 
 def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp_path):

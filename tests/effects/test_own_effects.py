@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from by_hand import LOADED, followed
 from commanded import run
 
 import vinetrack as vt
@@ -41,6 +42,15 @@ def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def test_it_is_simulated_like_any_other(tmp_path):
+    brush = own_effects([written(tmp_path)])
+    model = vt.make_model([*vt.base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
+    travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
+    times = np.linspace(0, travel.end, 41)  # type: ignore[attr-defined]
+    got = vt.simulate(model, LOADED.trial(), times).lead_position_m
+    np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * LOADED.L)
 
 
 def copies(folder: Path, text: str) -> list[Effect]:

@@ -13,6 +13,7 @@ from vinetrack.figures import damping_figures, motion_figures, overlay
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip
 from vinetrack.figures.style import RULE_COLOURS, look, render
+from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
@@ -57,10 +58,33 @@ def test_both_fits_are_lines_of_slope_n_in_the_band_of_the_covariance():
     assert damping_figures.log_force_sigma(fit(1.0), "vine0", x_ss_m_s) == pytest.approx(expected)
 
 
+def scaling() -> dict:
+    sizes = [6.0, 12.0, 18.0, 24.0]
+    B = [math.exp(-3.0) * size**1.8 for size in sizes]
+    power = {
+        "slope": 1.8,
+        "slope_95": [1.2, 2.4],
+        "intercept": -3.0,
+        "intercept_95": [-4.0, -2.0],
+        "R2": 0.98,
+        "p": 0.01,
+    }
+    family = {"along": "diameter_mm", "vines": [f"vine{i}" for i in range(4)], "sizes": sizes, "B": B}
+    family |= {"B_95_total": [[0.9 * b, 1.1 * b] for b in B], "power": power, "line": power | {"slope": 0.3}}
+    family |= {"refused": None}
+    return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
+
+
+def test_the_same_figure_gives_the_same_bytes():
+    first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
+    assert first == second
+
+
 @pytest.mark.slow
-def test_nothing_of_the_law_is_cut_off():
+def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
     for n_vines in (4, 20):
         assert_nothing_is_cut_off(draw_damping_law(points(n_vines), damping(n_vines)))
+    assert_nothing_is_cut_off(draw_scaling(scaling()))
 
 
 def test_without_content_there_is_no_figure():
@@ -209,3 +233,9 @@ def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_
     for line, at in zip((line for line in sheet.lines if line.get_linewidth() == 1.8), (20, 125, 223), strict=True):
         assert line.get_xdata() == pytest.approx([at, at])
         assert sorted(line.get_ydata()) == pytest.approx([15, 45])
+
+
+def test_a_strip_is_small_in_a_page():
+    body = inline_picture(render(draw_strip("a", tracking(900, 320), 1e-3), ["svg"])["svg"].decode(), "p", "strip")
+    assert len(body) < 60_000
+    assert "matrix(" in body

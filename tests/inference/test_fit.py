@@ -23,7 +23,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import optimiser, solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
-from vinetrack.inference.gaussian_processes import whiten
+from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
@@ -380,12 +380,6 @@ def test_a_step_that_is_short_by_its_damping_alone_is_no_convergence(campaign, m
     assert (found.converged, found.iterations) == (False, 4)
 
 
-def test_a_trajectory_that_overflows_costs_infinitely_much(campaign):
-    solution, predictor = campaign[0].solution, campaign[0].predictor
-    far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
-    assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
-
-
 def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch):
     whole, calls = Predictor.linearise, []
 
@@ -581,12 +575,29 @@ def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials()
     assert size == pytest.approx(0.3, abs=3 * sigma)
 
 
-def test_parameters_are_estimated_without_a_frame_at_rest():
+@pytest.fixture(scope="module")
+def only_in_motion():
     """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
     pairs = [(trial, track, track.time_s > 0.03) for trial, track in small_campaign(seed=7, replicates=1)[0]]
-    fit = vt.fit(vt.base_model(), [(t, as_track(x.time_s[seen], x.lead_position_m[seen])) for t, x, seen in pairs])
-    assert fit.converged
-    assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma < 0.06
+    return vt.fit(vt.base_model(), [(t, as_track(x.time_s[seen], x.lead_position_m[seen])) for t, x, seen in pairs])
+
+
+def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
+    assert only_in_motion.converged
+    assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
+    assert only_in_motion["n"].sigma < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("early_frames", [5, 20, 45])
+def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion, early_frames):
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    own = solution.state.trial_effects.copy()
+    own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
+    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
+    found = vt.refit(replace(only_in_motion, solution=elsewhere))
+    assert found.solution.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
+    assert np.isfinite(found["n"].sigma)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
@@ -600,3 +611,13 @@ def test_columns_at_a_release_are_the_shifted_and_whitened_ones(rho):
         columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
         columns[:, -1] = position_m - columns[:, -1]
         assert np.allclose(at.T, whiten(columns, first, rho, relative), rtol=1e-12, atol=1e-12)
+
+
+def test_a_fit_converges_from_its_own_solution(only_in_motion):
+    """And one whose trajectories overflow costs infinitely much, without a warning."""
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4)
+    assert found.converged
+    far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
+    assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
+    assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()

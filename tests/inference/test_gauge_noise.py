@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
-from lsoda_vine import as_track
+from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
 from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -123,6 +123,22 @@ def test_exact_traces_and_one_that_no_curve_explains_do_not_change_the_others():
         assert other.pressure_Pa == pytest.approx(one.pressure_Pa, abs=8.0)
         assert np.std(other.pressure_Pa) < 12.0
         assert other.mean_error_Pa == pytest.approx(60.0 * np.sqrt(1.7 / 0.3 / 400), rel=0.4)
+
+
+@pytest.mark.slow
+def test_stated_errors_cover_the_actual_errors():
+    made = [emptied(seed, 200.0) for seed in range(40)]
+    quiet = gauge.denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
+    sizes = []
+    for trace, (pressure_Pa, _, _) in zip(quiet, made, strict=True):
+        assert trace.mean_error_Pa == pytest.approx(200.0 / np.sqrt(TIMES_S.size), rel=0.25)
+        wrong_Pa = trace.pressure_Pa - pressure_Pa
+        along, stated_Pa, _ = np.linalg.svd(trace.errors_Pa, full_matrices=False)
+        tells = stated_Pa > 0.01 * stated_Pa[0]
+        sizes += list((along.T @ wrong_Pa / stated_Pa)[tells])
+    assert len(sizes) >= 40
+    # What all trials have together, clock and exponent, is stated √n times in each.
+    assert 0.45 < np.sqrt(np.mean(np.square(sizes))) < 1.5
 
 
 @pytest.mark.parametrize("per_reading", [3.4, 5.0, 18.0])
@@ -316,3 +332,36 @@ def test_trace_errors_suggest_no_exponent_per_vine(fit):
     """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
     apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
+
+
+@pytest.mark.slow
+def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge_each_in_its_own_trial():
+    """Sixteen trials; the gauge sees each pressure as it is, not as it was set, give or take 0.1 kPa a sample."""
+    pairs, truth = small_campaign(seed=21)
+    seen, draw, gauge_noise_Pa = [], np.random.default_rng(21), 100.0
+    for (trial, track), true in zip(pairs, truth, strict=True):
+        gauge_Pa = trial.pressure_Pa * true["pressure"] + gauge_noise_Pa * draw.standard_normal(track.time_s.size)
+        seen.append((trial, as_track(track.time_s, track.lead_position_m, gauge_Pa)))
+    traced = vt.fit(vt.base_model(), seen, profile=False)
+    assert traced.chi2_per_dof < 1.15
+    assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
+    for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
+        samples = np.count_nonzero(item.time_s >= trial.release_s)
+        assert item.gauge_error == pytest.approx(gauge_noise_Pa / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
+        assert abs(trial.pressure_deviation) < 4 * item.gauge_error
+    # The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds.
+    predictor = traced.predictor
+    trace = predictor.data[3].trace
+    ramp = np.linspace(-100.0, 100.0, trace[0].size)
+    data = [replace(trial_data, trace_errors_Pa=None) for trial_data in predictor.data]
+    data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
+    deaf = [replace(trial_data, trace_errors_Pa=None) for trial_data in data]
+    moved, without = (
+        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution).own for told in (data, deaf)
+    )
+    assert [each.shape[1] for each in moved] == [1] * 16
+    assert [each.shape[1] for each in without] == [0] * 16
+    assert all(not columns.any() for i, columns in enumerate(moved) if i != 3)
+    part = np.interp(data[3].time_s, trace[0], ramp) / np.interp(data[3].time_s, *trace)
+    expected = np.cumsum(np.diff(traced.solution.columns[3][:, PRESSURE], prepend=0.0) * part)
+    assert moved[3][:, 0] == pytest.approx(expected, abs=0.05 * np.ptp(expected))

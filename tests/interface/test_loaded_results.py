@@ -179,3 +179,16 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
     campaign = open_campaign(small_run)
     assert campaign.stored.numbers == loaded.fit.numbers
     assert dict(campaign.highest_m) == compared.set_index("condition")["expected_high_m"].to_dict()
+
+
+def test_the_worst_condition_is_one(loaded, report, small_run):
+    compared = loaded.tables["comparison"]
+    worst = str(compared.loc[compared["rms_position_m"].idxmax(), "condition"])
+    assert loaded.tables["diagnosis/conditions"]["condition"].iloc[0] == worst
+    pressure = f"{float(worst.partition('kPa')[0].rpartition('_')[2]):g} kPa"
+    assert f"Worst is {worst}" in report
+    assert loaded.diagnosis is not None
+    assert loaded.diagnosis.where[0].startswith(
+        (f"The model fails most at {pressure}", "In no condition does the mean")
+    )
+    assert pressure in (small_run / "figures" / "before_after.svg").read_text("utf-8")

@@ -117,6 +117,16 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors():
     assert abs(n[0] - np.polyfit(x[vine == 0], y[vine == 0], 1)[0]) > 1e-3
 
 
+@pytest.mark.slow
+def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes():
+    """σ(ln F) of 3 % B and 1 % P against var(ln F): the mean over 60 campaigns, good to 0.0005."""
+    fits = [fit_damping(scattered(seed, B_scatter=0.08), resamples=2) for seed in range(60)]
+    off = {method: np.array([fit[method]["n"] for fit in fits]) - N for method in METHODS}
+    error = {method: np.std(values) / math.sqrt(60) for method, values in off.items()}
+    assert abs(np.mean(off["both_axes"])) < 3 * error["both_axes"] + 5e-4
+    assert np.mean(off["log_log"]) < -3 * error["log_log"]
+
+
 @pytest.mark.parametrize("case", ["nothing", "two trials", "speeds that fall with the force"])
 def test_no_fit_without_enough_points_or_a_power_law(case):
     points = campaign(default_rng(0), vines=("R1",))

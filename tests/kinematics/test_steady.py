@@ -290,3 +290,23 @@ def test_a_cubic_is_returned_exactly(time_s, side):
     np.testing.assert_allclose(values[0], cubic(time_s), rtol=1e-9)
     np.testing.assert_allclose(values[2], cubic.deriv(2)(time_s), rtol=1e-6)
     assert np.all(fits.misfit < 1e-24)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+@pytest.mark.parametrize("time_s", [EVEN, GAPPED], ids=["even", "gapped"])
+def test_stated_error_is_that_of_many_draws(time_s, rho):
+    rng = np.random.default_rng(1000)
+    draws, point = [], 24
+    for _ in range(1500):
+        fits = fit_all_windows(time_s, ar1(time_s.size, 1.0, rho, rng), 15, 3, rho)
+        _, velocity, gain = fits.velocities(time_s, 0.0)
+        draws.append(velocity[point])
+    assert np.std(draws) == pytest.approx(gain[point], rel=0.06)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_misfit_of_noise_averages_its_number_of_terms(rho):
+    rng = np.random.default_rng(1000)
+    misfits = [fit_all_windows(EVEN, ar1(60, 1.0, rho, rng), 21, 3, rho).misfit[::20] for _ in range(500)]
+    assert np.mean(misfits) == pytest.approx(4.0, rel=0.08)

@@ -56,11 +56,13 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
         read_source_experiment(tmp_path)
 
 
-def test_what_a_diagnosis_says_stays_and_a_refused_one_has_no_verdict(tmp_path):
+def test_a_diagnosis_comes_back_as_it_was_written_and_a_refused_one_has_no_verdict(tmp_path):
     for verdict in VERDICTS:
         written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
+        again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
+        assert json.dumps(again) == json.dumps(written)
         kept = ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
-        assert {key: written[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
+        assert {key: again[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
     write_json(Results(tmp_path).diagnosis, refused("no trial moves"))
     back = read_diagnosis(Results(tmp_path))
     assert back is not None

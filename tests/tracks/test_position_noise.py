@@ -8,7 +8,7 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import savgol_filter
+from scipy.signal import lfilter, savgol_filter
 from vine_truth import CAPTURE_FPS, ar1, record, scaled
 
 import vinetrack as vt
@@ -381,6 +381,21 @@ def test_nothing_is_found_in_clean_trials(noise_m, rho):
             trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=rest, end_frames=end)
             alarms += correct_frames(trial.track).notes
     assert alarms == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.5])
+def test_outliers_of_heavy_tails_change_no_times(rho):
+    """Student's t with 3 degrees of freedom puts a point a whole step ahead or behind now and then."""
+    moved = 0
+    for seed in range(1000, 1150):
+        rng = np.random.default_rng(seed)
+        trial = record(scaled(4, 2.0), rng, noise_m=1e-9, rho=0.0, rest_frames=int(rng.integers(0, 60)))
+        kicks = rng.standard_t(3, trial.track.time_s.size) / np.sqrt(3)
+        wild = lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], kicks)
+        track = replace(trial.track, lead_position_m=trial.track.lead_position_m + 1e-4 * wild)
+        moved += any("later times" in note for note in correct_frames(track).notes)
+    assert moved <= 1
 
 
 def test_noise_that_grows_along_the_way_is_told_from_a_dropped_frame():

@@ -17,6 +17,7 @@ from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_p
 DEMO = preset("demo")
 CAMERA = Camera(m_per_px=1 / 2400, focal_px=1500, k1=-0.2, k2=0.05, tilt_x_deg=4, tilt_y_deg=-7)
 BOARD = Target(squares=(16, 5), square_m=0.020, marker_m=0.014, angle_deg=1.5)
+CHECKER = replace(BOARD, kind="checkerboard")
 
 
 def stated(target: Target = BOARD, **changes) -> Charuco | Checkerboard:
@@ -167,6 +168,15 @@ def test_a_charuco_board_that_is_not_as_stated_or_bent_is_refused(changes):
         seen = cv2.remap(seen, x, y + 6 * np.sin(x / 90), cv2.INTER_CUBIC)
     with pytest.raises(CalibrationError):
         calibrate_pictures([seen], stated(**changes))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("board", [stated(), stated(CHECKER)])
+def test_picture_without_a_target(board):
+    empty = np.random.default_rng(2005).integers(60, 90, (320, 960)).astype(np.uint8)
+    with pytest.raises(CalibrationError):
+        calibrate_pictures([empty], board)
+    assert find_board(empty) is None
 
 
 def test_file_that_is_no_picture(tmp_path):

@@ -24,6 +24,8 @@ from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video import frames as module
 from vinetrack.video import small_pictures
+from vinetrack.video.axis import Axis
+from vinetrack.video.edge import outline
 from vinetrack.video.frames import (
     PHANTOM_TABLE,
     Frames,
@@ -34,11 +36,13 @@ from vinetrack.video.frames import (
 )
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
-from vinetrack.video.strip import camera_unit
+from vinetrack.video.strip import Strip, camera_unit
 from vinetrack.video.track import track_frames, track_recording
 from vinetrack.video.write import write_clip
 
+RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
+NOISE = RNG.integers(0, 255, (60, 96, 128)).astype(np.uint8)
 DEEP = FRAMES.astype(np.uint16) * 17
 
 
@@ -137,6 +141,14 @@ def test_dng_frames_carry_rate_exposure_and_values(tmp_path):
     assert frames.recording.exposure_s == pytest.approx(1 / 5000)
     assert frames.luma.dtype == np.uint16
     assert [int(picture[8, 12]) for picture in frames.luma] == [3000, 3010, 3020, 3030]
+
+
+def test_fewer_frames_than_declared_are_reported(tmp_path):
+    path = write_video(tmp_path / "a.mp4", NOISE, options={"g": "5"}, container_options={"movflags": "+faststart"})
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    frames = read_frames(path)
+    assert 5 < len(frames) < 60
+    assert frames.notes
 
 
 TWELVE, TEN, EIGHT = (
@@ -507,6 +519,17 @@ def test_frames_beyond_lost_ones_are_not_used(clip):
     assert not track.usable[48:].any()
     error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]
     assert np.max(np.abs(error - np.median(error))) < 1e-3
+
+
+def test_a_tube_of_two_widths_has_one_of_them():
+    n, rows, columns = 60, 81, 240
+    values = np.random.default_rng(6).normal(60, 2, (n, rows, columns))
+    inside = np.abs(np.arange(rows) - rows // 2)[:, None] <= np.where(np.arange(columns) < 120, 8, 30)
+    for i in range(n):
+        values[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & inside)
+    luma, axis = np.clip(values, 0, 255).astype(np.uint8), Axis((0, 40), (columns - 1, 40), 40)
+    sides = outline(Strip(luma, np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False))
+    assert np.isfinite([sides.shift_px, sides.slope, sides.width_px]).all()
 
 
 GIVEN_UP = """

@@ -250,7 +250,7 @@ def _newton_on_fixed_columns(
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
         after = with_variances(products, before)
         new_level = log_likelihood(products, problem, after, solution.estimable)
-        if not new_level >= level - converged_decrease_smooth:
+        if not new_level >= level - converged_decrease_smooth:  # nor is NaN taken
             break
         cross_products, total_change, state, level = products, total_change + change, after, new_level
         if predicted_decrease < converged_decrease_smooth and variance_change(before, state) < CONVERGED_VARIANCES:

@@ -36,7 +36,6 @@ FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
 
 LENGTH_ERROR = 0.005  # Standard deviation of a vine's length, relative (chosen)
-FRAMES_BEHIND_END = 2  # Frames left out after the end of growth (derived)
 
 
 class FitError(UserError, ValueError):
@@ -320,7 +319,7 @@ def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], 
     end_reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
     last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if end_reached else np.inf
     excluded[points[y > min(begin_m + END_FRACTION * trial.length_m, last_m)]] = True
-    behind = points[end + FRAMES_BEHIND_END :] if end_reached and n_rest else points[:0]
+    behind = points[end:] if end_reached and n_rest else points[:0]
     kept = behind[track.usable[behind]][-1:]
     excluded[kept] = False
     return excluded, kept
