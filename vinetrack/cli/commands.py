@@ -131,7 +131,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     results = Results(target)
     if results.provenance.exists():
         source = read_source_experiment(target, experiment)
-        pairs, _ = measured_trials(source, results)
+        pairs = measured_trials(source, results)
         diagnosis = diagnosed(source, results, pairs, report)
         if json is None:
             write_diagnosis(results, diagnosis, pairs, run_settings(read_json(results.provenance)["settings"]))

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.records import Kinematics, Track, Trial, plain_track
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import Printed, plot
 from vinetrack.diagnosis.ladder import Comparison
@@ -280,13 +280,12 @@ Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
 @dataclass(frozen=True)
 class TrialSource:
     """Trials with their tracks, their experiment, and the reasons why trials were left out. `experiment` is None for a
-    frame and for pairs; `kinematics` are those of a results folder, by name of trial.
+    frame and for pairs.
     """
 
     pairs: list[tuple[Trial, Track]]
     experiment: Experiment | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
-    kinematics: Mapping[str, Kinematics] = field(default_factory=dict)
 
     @property
     def tracks(self) -> dict[str, Track]:
@@ -304,8 +303,8 @@ def read_source(source: Source) -> TrialSource:
         return TrialSource(tracks_from_frame(source))
     if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
         experiment = folder_layout.read_source_experiment(Path(source))
-        pairs, kinematics = folder_layout.measured_trials(experiment, Results(Path(source)))
-        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
+        pairs = folder_layout.measured_trials(experiment, Results(Path(source)))
+        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out})
     if isinstance(source, (str, Path)):
         source = read_experiment(source)
     pairs, left_out = pairs_of(source)
@@ -561,15 +560,14 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     if not isinstance(fitted, Fit):
         given = read_source(fitted)
         fit_of_source = fit_pairs(named_model(given.experiment), given.pairs)
-        return compare_pairs(fit_of_source, given.pairs, kinematics=given.kinematics, **options)
+        return compare_pairs(fit_of_source, given.pairs, **options)
     if "tracks" in options:
         return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
     if source is None:
         if not fitted.pairs:
             raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
         return compare_pairs(fitted, fitted.pairs, **options)
-    given = read_source(source)
-    return compare_pairs(fitted, given.pairs, **{"kinematics": given.kinematics, **options})
+    return compare_pairs(fitted, read_source(source).pairs, **options)
 
 
 def named_model(experiment: Experiment | None) -> Model:

@@ -140,7 +140,7 @@ class Campaign:
 def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
     """Read the results folder of an experiment."""
     results = Results(folder)
-    pairs, _ = measured_trials(experiment, results)
+    pairs = measured_trials(experiment, results)
     data, left_out = prepare(pairs, weighted=False)
     if not data:
         raise ResultsError(f"{folder} has no trial to explore: {reasons_told(left_out) or 'every trial failed'}")

@@ -45,6 +45,7 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+from vinetrack.kinematics.velocity import estimate_kinematics
 from vinetrack.narrative.diagnosis_text import added_in_words, proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
@@ -84,10 +85,12 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
     """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis, with its trials."""
     experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
-    pairs, kinematics = measured_trials(experiment, results)
+    pairs = measured_trials(experiment, results)
     initial: Fit | None = None
     try:
         initial, fit = _fits(experiment, pairs)
+        how = job.settings.velocity.model_dump()
+        kinematics = {t.name: estimate_kinematics(track, travel_ratio=t.travel_ratio, **how) for t, track in pairs}
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
         check, messages = table_of(CHECK_COLUMNS), list[str]()
         try:
@@ -252,7 +255,7 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
 
 def add_effects(experiment: Experiment, folder: Path, names: Sequence[str], report: Report) -> tuple[list[str], Any]:
     """Add effects to the model and refit. Returns lines, and the ladder of errors of both models."""
-    tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))[0]}
+    tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))}
     before, after, table = add(experiment, tracks, names, report)
     return added_in_words(before, after, table), table.to_dict("records")
 
@@ -270,7 +273,7 @@ def propose_effect(
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
-    proposal = propose(model, measured_trials(experiment, results)[0], report)
+    proposal = propose(model, measured_trials(experiment, results), report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}

@@ -456,7 +456,7 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
         diagnosis = read_diagnosis(results)
         if diagnosis is not None and diagnosis.final_verdict == ADEQUATE:
             added = diagnosis.effects
-        pairs: Pairs = measured_trials(experiment, results)[0]
+        pairs: Pairs = measured_trials(experiment, results)
     else:
         with suppress(ExperimentError):  # recordings that do not exist yet: a plan
             experiment = read_experiment(target) if target.is_dir() else None

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import InputError, UserError
-from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.core.records import Track, Trial
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -212,12 +212,9 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
     return read_experiment(path)
 
 
-def measured_trials(
-    experiment: Experiment, results: Results
-) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
-    """Read the trials that did not fail, with their tracks, and their kinematics by name of trial."""
-    pairs, kinematics = [], {}
-    failed: set[str] = set()
+def measured_trials(experiment: Experiment, results: Results) -> list[tuple[Trial, Track]]:
+    """Read the trials that did not fail, with their tracks."""
+    pairs, failed = [], set[str]()
     if results.trials.exists():
         gathered = read_result(results.trials)
         failed = set(gathered.loc[gathered["status"] == "failed", "trial"])
@@ -227,15 +224,7 @@ def measured_trials(
             continue
         with _reading(results.track(trial.name)):
             pairs.append((trial, read_stored_track(table)))
-        motion = read_result(results.kinematics(trial.name))
-        with _reading(results.kinematics(trial.name)):
-            columns: dict[str, Any] = {
-                name: motion[name].to_numpy(dtype=float) for name in KINEMATICS_COLUMNS if name != "tail_velocity_m_s"
-            }
-        # Smoothing windows and noise are not stored.
-        columns |= {"window_points": np.zeros(len(motion), dtype=int), "noise_m": np.nan}
-        kinematics[trial.name] = Kinematics(**columns, noise_correlation=np.nan, travel_ratio=trial.travel_ratio)
-    return pairs, kinematics
+    return pairs
 
 
 def read_stored_track(table: pd.DataFrame) -> Track:
