@@ -5,7 +5,7 @@ figures by name; and `vt.fit`, `vt.diagnose`, `vt.power` and `vt.compare` for tr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -35,7 +35,7 @@ from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
-from vinetrack.inference.fit_data import FitError, Pairs
+from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results import folder_layout
@@ -277,38 +277,24 @@ def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
 Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
 
 
-@dataclass(frozen=True)
-class TrialSource:
-    """Trials with their tracks, their experiment, and the reasons why trials were left out. `experiment` is None for a
-    frame and for pairs.
+def read_source(
+    source: Source, tracks: Mapping[str, Track] | None = None
+) -> tuple[list[tuple[Trial, Track]], Experiment | None, dict[str, str]]:
+    """Read trials from any source; `tracks` go before those that an experiment names. Returns pairs of trial and track,
+    their experiment (None for a frame and for pairs), and the reasons why trials were left out, by name.
     """
-
-    pairs: list[tuple[Trial, Track]]
-    experiment: Experiment | None = None
-    left_out: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def tracks(self) -> dict[str, Track]:
-        """Tracks by name of trial."""
-        return {trial.name: track for trial, track in self.pairs}
-
-
-def read_source(source: Source) -> TrialSource:
-    """Read trials and tracks from any source."""
-    from vinetrack.inference.fit_data import pairs_of
-
     if isinstance(source, LoadedResults):
         source = source.folder
     if isinstance(source, pd.DataFrame):
-        return TrialSource(tracks_from_frame(source))
-    if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
+        return tracks_from_frame(source), None, {}
+    if isinstance(source, (str, Path)) and tracks is None and (Path(source) / PROVENANCE).exists():
         experiment = folder_layout.read_source_experiment(Path(source))
         pairs = folder_layout.measured_trials(experiment, Results(Path(source)))
-        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out})
+        return pairs, experiment, {**experiment.failed, **experiment.left_out}
     if isinstance(source, (str, Path)):
         source = read_experiment(source)
-    pairs, left_out = pairs_of(source)
-    return TrialSource(pairs, source if isinstance(source, Experiment) else None, left_out)
+    pairs, left_out = pairs_of(source, tracks)
+    return pairs, source if isinstance(source, Experiment) else None, left_out
 
 
 # ------------------------------------------------------------------------------
@@ -443,11 +429,9 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     >>> fit.table()["unit"].tolist()
     ['N·(s/m)ⁿ', '1', 'Pa']
     """
-    if "tracks" in options:
-        return fit_pairs(model, source, **options)  # type: ignore[arg-type]
-    given = read_source(source)
-    fitted = fit_pairs(model, given.pairs, **options)
-    return replace(fitted, left_out={**given.left_out, **fitted.left_out})
+    pairs, _, left_out = read_source(source, options.pop("tracks", None))
+    fitted = fit_pairs(model, pairs, **options)
+    return replace(fitted, left_out={**left_out, **fitted.left_out})
 
 
 def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
@@ -481,12 +465,11 @@ def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
     """
     from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
 
-    if isinstance(source, Fit) or "tracks" in options:
-        return diagnose_pairs(source, **options)  # type: ignore[arg-type]
-    given = read_source(source)
-    if given.experiment is None:
-        return diagnose_pairs(given.pairs, **options)
-    return diagnose_pairs(given.experiment, tracks=given.tracks, **options)
+    if isinstance(source, Fit):
+        return diagnose_pairs(source, **options)
+    pairs, experiment, _ = read_source(source, options.pop("tracks", None))
+    tracks = {trial.name: track for trial, track in pairs}
+    return diagnose_pairs(experiment or pairs, tracks=tracks, **options)
 
 
 def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
@@ -526,7 +509,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
         source = source.folder
     if isinstance(source, str | Path):
         return power_of_target(PowerRequest(Path(source), effects, **options))
-    given = source if isinstance(source, Fit) else read_source(source).pairs
+    given = source if isinstance(source, Fit) else read_source(source)[0]
     return power_of_target(PowerRequest(Path("trials"), effects, **options), given)
 
 
@@ -557,17 +540,17 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     >>> list(comparison.table.columns)[:3]
     ['model', 'condition', 'rms_position_m']
     """
-    if not isinstance(fitted, Fit):
-        given = read_source(fitted)
-        fit_of_source = fit_pairs(named_model(given.experiment), given.pairs)
-        return compare_pairs(fit_of_source, given.pairs, **options)
-    if "tracks" in options:
-        return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
-    if source is None:
-        if not fitted.pairs:
-            raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
-        return compare_pairs(fitted, fitted.pairs, **options)
-    return compare_pairs(fitted, read_source(source).pairs, **options)
+    tracks = options.pop("tracks", None)
+    if isinstance(fitted, Fit):
+        fit_shown, pairs = fitted, list(fitted.pairs)
+    else:
+        pairs, experiment, _ = read_source(fitted, tracks)
+        fit_shown = fit_pairs(named_model(experiment), pairs)
+    if source is not None:
+        pairs, *_ = read_source(source, tracks)
+    if not pairs:
+        raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
+    return compare_pairs(fit_shown, pairs, **options)
 
 
 def named_model(experiment: Experiment | None) -> Model:
