@@ -133,7 +133,7 @@ class LoadedResults(Printed):
 
     def _model(self, fit: FitSummary) -> Model:
         own = not set(fit.names) <= set(catalogue())
-        model = make_model(fit.names, named_model(self.experiment).user_effects if own else {})
+        model = make_model(fit.names, self.experiment.user_effects if own else {})
         return model.with_values({key: one for key, one in fit.fitted_values.items() if key in model.parameter_names})
 
     def _concatenated(self, path_of: Callable[[str], Path]) -> pd.DataFrame:
@@ -545,19 +545,13 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
         fit_shown, pairs = fitted, list(fitted.pairs)
     else:
         pairs, experiment, _ = read_source(fitted, tracks)
-        fit_shown = fit_pairs(named_model(experiment), pairs)
+        named = () if experiment is None else (experiment.settings.model, experiment.user_effects)
+        fit_shown = fit_pairs(make_model(*named), pairs)
     if source is not None:
         pairs, *_ = read_source(source, tracks)
     if not pairs:
         raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
     return compare_pairs(fit_shown, pairs, **options)
-
-
-def named_model(experiment: Experiment | None) -> Model:
-    """Return the model that an experiment names, including the user's own effects; without one, the base model."""
-    if experiment is None:
-        return make_model()
-    return make_model(experiment.settings.model, experiment.user_effects)
 
 
 def example_tracks() -> pd.DataFrame:
