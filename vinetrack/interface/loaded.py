@@ -340,10 +340,10 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
 
 
 def _draw_figure(tables: Any, name: str = "") -> Figure:
-    """Draw a figure, or the first with content."""
-    known = {one: entry for one, entry in campaign_figures().items() if all(hasattr(tables, t) for t in entry.reads)}
-    names = [name] if name else list(known)
-    return _with_content(next((drawn for one in names if one in known and (drawn := draw(one, tables))), None), name)
+    """Draw a figure, or the first with content; only the tables that it shows are read."""
+    asked = [one for one in campaign_figures().values() if name in ("", one.name)]
+    drawn = (draw(one.name, tables) for one in asked if all(hasattr(tables, table) for table in one.reads))
+    return _with_content(next(filter(None, drawn), None), name)
 
 
 def _with_content(drawn: Figure | None, name: str) -> Figure:
