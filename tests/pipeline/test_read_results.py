@@ -107,7 +107,7 @@ def folder(path: Path, content: dict | None, after: bool = True) -> Results:
         pd.concat(parts).to_csv(results.trajectories(condition), index=False)
     rows = [("v", name, low, low + 0.1, 0.011, 0.001) for name in ("slow", "fast", "") for low in (0.0, 0.1)]
     columns = ["vine", "condition", "from_m", "to_m", "mean_residual_m", "sigma_m"]
-    pd.DataFrame(rows, columns=columns).to_csv(results.diagnosed("along_position.csv"), index=False)
+    pd.DataFrame(rows, columns=columns).to_csv(path / "diagnosis" / "along_position.csv", index=False)
     return results
 
 
@@ -239,7 +239,7 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
     assert contradicted.next_experiment is None
     write_json(results.diagnosis, contradicted.to_json())
     with pytest.raises(ResultsError, match="pressure_kPa"):
-        propose_effect(None, tmp_path, None, print)
+        propose_effect(None, tmp_path, print)
 
 
 def test_a_figure_is_shown_from_the_files_there_are(tmp_path, monkeypatch):

@@ -170,12 +170,12 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
 
 
 @command()
-def _propose(results: Path, to: Path | None, experiment: Path | None, report: Say) -> Answer:
+def _propose(results: Path, experiment: Path | None, report: Say) -> Answer:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
     from vinetrack.pipeline.model_stage import propose_effect
     from vinetrack.results.folder_layout import read_source_experiment
 
-    lines, files = propose_effect(read_source_experiment(results, experiment), results, to, report)
+    lines, files = propose_effect(read_source_experiment(results, experiment), results, report)
     return lines, {"lines": lines, "files": files}
 
 

@@ -260,9 +260,7 @@ def add_effects(experiment: Experiment, folder: Path, names: Sequence[str], repo
     return added_in_words(before, after, table), table.to_dict("records")
 
 
-def propose_effect(
-    experiment: Experiment, folder: Path, to: Path | None, report: Report
-) -> tuple[list[str], list[Path]]:
+def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
     """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
     results = Results(folder)
     diagnosis = read_diagnosis(results)
@@ -278,25 +276,21 @@ def propose_effect(
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}
     facts |= {"before_m": proposal.rms_left_out_m}
-    files = []
+    files: dict[Path, str] = {}
     if proposal.tied:
         best = proposal.tied[0]
         origin = remark("law_origin", **facts, rms_m=best.rms_left_out_m, gain=best.ratio.delta_chi2)
-        files.append((best.effect.path.name, best.text(str(origin))))
+        files[experiment.folder / best.effect.path.name] = best.text(str(origin))
     if (table := proposal.table) is not None:
         origin = remark("table_origin", **facts, rms_m=table.rms_left_out_m)
-        files.append((table.effect.path.name, table.text(str(origin))))
-    paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
-    if to is not None and paths:
-        paths[0] = to
-    for path in paths:
-        if path.exists():
-            raise ResultsError(f"{path} exists already: move it away, or give another file with --to.")
-    for path, (_, text) in zip(paths, files, strict=True):
+        files[experiment.folder / table.effect.path.name] = table.text(str(origin))
+    if there := [path for path in files if path.exists()]:
+        raise ResultsError(f"{there[0]} exists already: move it away.")
+    for path, text in files.items():
         write_text(path, text)
         remember(path)
         lines.append(f"Written to {path}. Read it, then fit it with `vinetrack add {path} {folder}`.")
     if files:
         settings = experiment.folder / "experiment.yaml"
         lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
-    return lines, paths
+    return lines, list(files)

@@ -103,8 +103,7 @@ class Results:
     audit = _File("audit.csv")  # Size of neglected effects along the motion of each trial
     diagnosis = _File("diagnosis.json")  # The diagnosis of the model in use
     ladder = _File("ladder.csv")  # Errors of the initial model and of each later model
-    steps = _File("diagnosis", "steps.csv")  # The ladder, below the steps of earlier runs to the model in use
-    kept_steps = _File(".kept", "steps.csv")  # The same, where a run does not begin by deleting it
+    kept_steps = _File(".kept", "steps.csv")  # As `diagnosis/steps.csv`, where a run does not begin by deleting it
     final_fit = _File("diagnosis", "final_fit.json")  # The fit with all added effects; exists only if there are any
     overlays = _File("overlays")  # Folder of the clips
     provenance = _File("provenance.json")  # Versions, settings and hashes of all inputs
@@ -115,7 +114,6 @@ class Results:
     analysed = _Named("analysed", ".json")  # A trial's contribution to the tables of the experiment
     trajectories = _Named("comparison", ".csv")  # Measured and modelled trajectories of one condition
     predictions = _Named("diagnosis/predictions", ".csv")  # Predictions of one trial, by the initial and final model
-    diagnosed = _Named("diagnosis")  # Another file of the diagnosis
     overlay = _Named("overlays", ".mp4")  # The clip of one trial with the edges drawn
     figure = _Named("figures")  # A figure of the whole experiment
     trial_figure = _Named("figures", prefix="trial_")  # The figure of one trial
