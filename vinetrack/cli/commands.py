@@ -149,10 +149,11 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
 @command()
 def _add(effect: str, results: Path, save: bool, experiment: Path | None, report: Say) -> Answer:
     """Add an effect to the model, or several as A+B, refit, and show the error before and after."""
+    from vinetrack.diagnosis.propose import add
+    from vinetrack.narrative.diagnosis_text import added_in_words
     from vinetrack.pages.draft_files import save_model
-    from vinetrack.pipeline.model_stage import add_effects
     from vinetrack.pipeline.workflow import command_for_results
-    from vinetrack.results.folder_layout import read_source_experiment
+    from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
 
     read = read_source_experiment(results, experiment)
     names = [effect] if Path(effect).is_file() else effect.split("+")
@@ -161,12 +162,14 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
         raise UserError(
             f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
         )
-    lines, ladder = add_effects(read, results, names, report)
+    tracks = {trial.name: track for trial, track in measured_trials(read, Results(results))}
+    before, after, ladder = add(read, tracks, names, report)
+    lines = added_in_words(before, after, ladder)
     if save:
         added = [Path(name).stem for name in names]
         path = save_model(read.folder, [*read.settings.model, *added], [file.name for file in own_files])
         lines.append(f"Saved to {path}; to update all results: {command_for_results(read.folder, results)}")
-    return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder}
+    return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder.to_dict("records")}
 
 
 @command()

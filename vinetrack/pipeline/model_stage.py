@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from vinetrack.diagnosis.ladder import (
     with_host,
 )
 from vinetrack.diagnosis.locate import drift_groups
-from vinetrack.diagnosis.propose import add, propose
+from vinetrack.diagnosis.propose import propose
 from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
 from vinetrack.dynamics.audit import audit, motion_since
@@ -46,7 +46,7 @@ from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 from vinetrack.kinematics.velocity import estimate_kinematics
-from vinetrack.narrative.diagnosis_text import added_in_words, proposal_lines
+from vinetrack.narrative.diagnosis_text import proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
@@ -251,13 +251,6 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
         models = {"model_before_m": one.predicted_position_m, "model_after_m": final.get(one.name, np.nan)}
         found.append((one, pd.DataFrame(measured | models)))
     return found
-
-
-def add_effects(experiment: Experiment, folder: Path, names: Sequence[str], report: Report) -> tuple[list[str], Any]:
-    """Add effects to the model and refit. Returns lines, and the ladder of errors of both models."""
-    tracks = {trial.name: track for trial, track in measured_trials(experiment, Results(folder))}
-    before, after, table = add(experiment, tracks, names, report)
-    return added_in_words(before, after, table), table.to_dict("records")
 
 
 def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
