@@ -335,10 +335,9 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate."""
     import pandas as pd
 
-    from vinetrack.figures.style import check_figure, write_figure
+    from vinetrack.figures.style import write_figure
     from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
 
-    check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))
     lines = str(power).splitlines()
     if figure is not None:

@@ -101,7 +101,8 @@ def _log_to(path: Path | None) -> None:
 
 
 # Type of an option by its kind; text for all other kinds
-_TYPES: dict[str, Any] = {"number": float, "count": int, "path": Path, "flag": bool, "texts": list[str]}
+_TYPES: dict[str, Any] = {"number": float, "count": int, "flag": bool, "texts": list[str]}
+_TYPES |= dict.fromkeys(("path", "picture"), Path)
 
 # What a command returns: lines, the same content for a program, and whether it found a fault, by default not
 Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
@@ -207,6 +208,8 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
         return tuple(given or ())
     if kind == "choice" and given not in (None, *line["metavar"].split("|")):
         raise _refused(line, f"{given!r} is neither {line['metavar'].replace('|', ' nor ')}")
+    if kind == "picture" and given is not None and given.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise _refused(line, f"'{given}' is not the name of a picture: end it in .png, .svg or .pdf")
     if kind == "column" and given is not None:
         try:
             return COLUMNS[line["field"]].read(given)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_bytes
 
 if TYPE_CHECKING:
@@ -141,16 +140,8 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
 
 def write_figure(fig: Figure, path: Path) -> None:
     """Write a figure in the format that the suffix names."""
-    check_figure(path)
     form = path.suffix.lower().removeprefix(".")
     write_bytes(path, render(fig, [form])[form])
-
-
-def check_figure(path: Path | None) -> None:
-    """Check the suffix of an output figure before anything is computed."""
-    if path is not None and path.suffix.lower() not in (".png", ".svg", ".pdf"):
-        problem = Problem(message="is not the name of a picture", file=str(path), remedy="end it in .png, .svg or .pdf")
-        raise ExperimentError([problem])
 
 
 # ------------------------------------------------------------------------------

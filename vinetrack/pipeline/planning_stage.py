@@ -41,7 +41,7 @@ from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import Limits, read_experiment_settings
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
-from vinetrack.figures.style import check_figure, write_figure
+from vinetrack.figures.style import write_figure
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
@@ -161,7 +161,6 @@ def predict_conditions(
     """Predict all conditions, see `read_basis`; write figure and curves if requested. Returns lines, JSON content."""
     import pandas as pd
 
-    check_figure(figure)
     basis = read_basis(**given)
     all_inputs = progress(basis.inputs, "predicting")
     predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
@@ -288,7 +287,6 @@ def design_vine(
     at_fraction: float, figure: Path | None = None, **given: Any,
 ) -> tuple[list[str], dict[str, Any]]:  # fmt: skip
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
-    check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
     films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",")]
     room = vines.Room(
@@ -352,7 +350,6 @@ def design_reservoir(
     *, within_percent: float, supply_s: float, at_fraction: float, figure: Path | None = None, **given: Any
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
-    check_figure(figure)
     basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
     trial, loss, swept = basis.planned.trials[0], within_percent / 100, vines.swept_m3(basis.planned.trials[0])
     inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None

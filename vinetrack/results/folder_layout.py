@@ -221,15 +221,10 @@ def measured_trials(experiment: Experiment, results: Results) -> list[tuple[Tria
         if not len(table) or trial.name in failed:
             continue
         with _reading(results.track(trial.name)):
-            pairs.append((trial, read_stored_track(table)))
+            names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px")
+            columns: dict[str, Any] = {name: table[name].to_numpy(dtype=float) for name in names}
+            for name in ("lead_position_systematic_m", "pressure_Pa"):  # not known where it is NaN in every frame
+                values = table[name].to_numpy(dtype=float)
+                columns[name] = values if np.isfinite(values).any() else None
+            pairs.append((trial, Track(**columns, flag=table["flag"].to_numpy(dtype=str))))
     return pairs
-
-
-def read_stored_track(table: pd.DataFrame) -> Track:
-    """Make a track of `tracks/<trial>.csv`; what is NaN in every frame is not known."""
-    names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px")
-    columns: dict[str, Any] = {name: table[name].to_numpy(dtype=float) for name in names}
-    for name in ("lead_position_systematic_m", "pressure_Pa"):
-        values = table[name].to_numpy(dtype=float)
-        columns[name] = values if np.isfinite(values).any() else None
-    return Track(**columns, flag=table["flag"].to_numpy(dtype=str))
