@@ -120,8 +120,7 @@ def _one_line(text: str) -> str:
 
 def in_words(told: Any) -> str:
     """Return a remark or a result in words; they are made in a room above, imported when words are requested."""
-    words: str = import_module("vinetrack.narrative").in_words(told)
-    return words
+    return str(import_module("vinetrack.narrative").in_words(told))
 
 
 def joined(names: Sequence[str], last: str = "and") -> str:

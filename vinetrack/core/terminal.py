@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import repeat, zip_longest
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,9 @@ class Printed:
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
-def plot(shown: Any, name: str = "", **options: Any) -> Figure:
-    """Draw an object as in the report; figures are made in a room above, imported when one is requested."""
-    figure: Figure = import_module("vinetrack.interface.loaded").figure_of(shown, name, **options)
-    return figure
+class Drawn:
+    """What the report has figures of; they are made in a room above, imported when one is requested."""
+
+    def plot(self, name: str = "", **options: Any) -> Figure:
+        """Return a figure of the report by its name; blank for the main one."""
+        return cast("Figure", import_module("vinetrack.interface.loaded").figure_of(self, name, **options))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
-from vinetrack.core.terminal import plot, table
+from vinetrack.core.terminal import Drawn, table
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import number
 from vinetrack.diagnosis.result import EXPECTED
@@ -42,7 +42,6 @@ from vinetrack.tracks.position_noise import rest_points
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from vinetrack.experiment.folder import Experiment
 
@@ -331,7 +330,7 @@ FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at whic
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison:
+class Comparison(Drawn):
     """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`. `trajectories` holds
     the frames of each condition with the model's prediction, see `Replicates`. `trials` are the predictions.
     """
@@ -339,10 +338,6 @@ class Comparison:
     table: pd.DataFrame
     trajectories: Mapping[str, pd.DataFrame]
     trials: tuple[TrialFit, ...]
-
-    def plot(self, name: str = "model_comparison") -> Figure:
-        """Return a figure of the report: `model_comparison` or `model_residuals`."""
-        return plot(self, name)
 
     def __repr__(self) -> str:
         return f"Comparison({len(self.trials)} trials, {len(self.table)} conditions)"

@@ -16,12 +16,11 @@ from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from vinetrack.core.problems import Remark, in_words
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import Printed, plot
+from vinetrack.core.terminal import Drawn, Printed
 from vinetrack.inference.fit_result import Fit, Number, OrNaN, or_open
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.locate import Failure
 
@@ -185,7 +184,7 @@ StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSeriali
 
 
 @dataclass(frozen=True)
-class Power(JsonRecord):
+class Power(Drawn, JsonRecord):
     """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
     The probability of any false alarm is at most `false_alarm_rate`.
     """
@@ -226,10 +225,6 @@ class Power(JsonRecord):
             "simulated": [rates.to_json() for rates in self.simulated],
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
-
-    def plot(self, name: str = "power", **options: Any) -> Figure:
-        """Draw the map of effects against size."""
-        return plot(self, name, **options)
 
     def __str__(self) -> str:
         return in_words(self)
@@ -338,7 +333,7 @@ def _told(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(Printed, JsonRecord):
+class Diagnosis(Printed, Drawn, JsonRecord):
     """The result of a diagnosis. Printed, it is the text on the terminal. `effects` are those added, in order; `fits`
     the initial model and every enlarged one; `not_tried` lack what the sheet leaves blank, where nothing explains it.
     """
@@ -445,10 +440,6 @@ class Diagnosis(Printed, JsonRecord):
         if "verdict" in stored and not stored.get("rounds"):
             stored["rounds"] = [{"verdict": stored["verdict"]}]
         return replace(super().from_json(stored), ladder=ladder)
-
-    def plot(self, name: str = "", **options: Any) -> Figure:
-        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name."""
-        return plot(self, name, **options)
 
     def __repr__(self) -> str:
         named = ", ".join(self.effects or self.answer_set)

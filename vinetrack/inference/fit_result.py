@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import Printed, plot, table
+from vinetrack.core.terminal import Drawn, Printed, table
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
@@ -25,7 +25,6 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from vinetrack.inference.marginal_likelihood import FitState
     from vinetrack.inference.optimiser import Solution
@@ -469,7 +468,7 @@ class NumberTable(Printed):
 
 
 @dataclass(frozen=True, repr=False)
-class Fit(NumberTable):
+class Fit(NumberTable, Drawn):
     """A model fitted to trajectories. Printed, it is a table. `model` has the fitted values. `covariance` is that of
     `numbers`, SI, in their order.
     """
@@ -523,10 +522,6 @@ class Fit(NumberTable):
             for trial in self.trials
         ]
         return pd.concat(parts, ignore_index=True)
-
-    def plot(self, name: str = "model_comparison", **options: Any) -> Figure:
-        """A figure of the report for this model: `model_comparison` or `model_residuals`."""
-        return plot(self, name, **options)
 
     def __repr__(self) -> str:
         return f"Fit({' + '.join(self.model.names)}; {len(self.trials)} trials)"

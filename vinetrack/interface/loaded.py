@@ -18,7 +18,7 @@ import pandas as pd
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import Printed, plot
+from vinetrack.core.terminal import Drawn, Printed
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.result import Diagnosis, Power
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from vinetrack.results.diagnosis_tables import DiagnosisTables
 
 
-class LoadedResults(Printed):
+class LoadedResults(Printed, Drawn):
     """A results folder, whose files are read on first access. Tables are pandas DataFrames whose columns carry their
     units, as in the files (`docs/results.md`).
     """
@@ -142,10 +142,6 @@ class LoadedResults(Printed):
         if not parts:
             return pd.DataFrame(columns=["trial"])
         return pd.concat(parts, names=["trial"]).reset_index(level="trial").reset_index(drop=True)
-
-    def plot(self, name: str = "", **options: Any) -> Figure:
-        """Return a figure of the report."""
-        return plot(self, name, **options)
 
     def __repr__(self) -> str:
         return f"Results({self.name}: {self._state()})"
