@@ -339,10 +339,7 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
 
     power = power_of_target(PowerRequest(target=target, **options))
-    lines = str(power).splitlines()
-    if figure is not None:
-        write_figure(power.plot(), figure)
-        lines.append(f"Figure: {figure}")
+    lines = [*str(power).splitlines(), *write_figure(figure, power.plot)]
     if rows_file is not None and (rows := sheet_rows(power)):
         write_csv(rows_file, pd.DataFrame(rows))
         lines.append(f"Rows of the sheet: {rows_file}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -138,10 +138,13 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
     return files
 
 
-def write_figure(fig: Figure, path: Path) -> None:
-    """Write a figure in the format that the suffix names."""
+def write_figure(path: Path | None, draw: Callable[[], Figure]) -> list[str]:
+    """Write a figure in the format that the suffix names, where one is asked for; return the line that says so."""
+    if path is None:
+        return []
     form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, render(fig, [form])[form])
+    write_bytes(path, render(draw(), [form])[form])
+    return [f"Figure: {path}"]
 
 
 # ------------------------------------------------------------------------------

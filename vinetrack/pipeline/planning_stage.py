@@ -168,10 +168,8 @@ def predict_conditions(
     shown = _table_lines(predictions) if len(predictions) > 1 else _condition_lines(predictions[0])
     lines = [*basis.heading, *shown]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
-    if figure is not None:
-        titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
-        write_figure(draw_predictions(predictions, titles, at_fraction), figure)
-        lines.append(f"Figure: {figure}")
+    titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
+    lines += write_figure(figure, partial(draw_predictions, predictions, titles, at_fraction))
     if csv is not None:
         write_csv(csv, pd.concat([prediction.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
@@ -304,10 +302,7 @@ def design_vine(
         raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with waiting("looking for the fastest vine"):
         choices = vines.fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    lines = [*basis.heading, *_vine_lines(room, choices)]
-    if figure is not None:
-        write_figure(draw_choice(choices), figure)
-        lines.append(f"Figure: {figure}")
+    lines = [*basis.heading, *_vine_lines(room, choices), *write_figure(figure, partial(draw_choice, choices))]
     entries = []
     for choice in choices:
         trial, final = choice.prediction.inputs.trial, choice.prediction.final
@@ -384,10 +379,9 @@ def design_reservoir(
             lines.append(str(remark("supplied_chambers", ms=1e3 * supply_s, volumes=volumes)))
         elif math.isfinite(supply_s):
             lines.append(f"! {remark('supply_needs_wall')}")
-    if figure is not None:
-        drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
-        write_figure(draw_reservoir(drawn_m3, _losses(trial, drawn_m3), loss, swept, trial.chamber_m3), figure)
-        lines.append(f"Figure: {figure}")
+    drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
+    drawn = partial(draw_reservoir, drawn_m3, _losses(trial, drawn_m3), loss, swept, trial.chamber_m3)
+    lines += write_figure(figure, drawn)
     return lines, {"warnings": basis.heading, "chambers": entries}
 
 
