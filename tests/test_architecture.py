@@ -33,7 +33,7 @@ BUDGETS = {
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 29),
     "inference": (5646, 14, 51),
-    "interface": (599, 2, 2),
+    "interface": (570, 2, 2),
     "kinematics": (1665, 6, 12),
     "laboratory": (1600, 6, 9),
     "narrative": (1070, 3, 8),
@@ -42,7 +42,7 @@ BUDGETS = {
     "pipeline": (1999, 7, 6),
     "planning": (1583, 4, 24),
     "report": (746, 3, 4),
-    "results": (485, 4, 9),
+    "results": (475, 4, 9),
     "tracks": (1482, 4, 19),
     "video": (5216, 15, 78),
 }

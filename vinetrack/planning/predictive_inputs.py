@@ -251,8 +251,6 @@ class FitNumbers:
     def __post_init__(self) -> None:
         if not isinstance(self.fit, Fit) and self.fit.refused:
             raise FitError(f"{self.source} holds no fit to predict from: {self.fit.refused}")
-        if not self.fit.numbers:
-            raise FitError(f"{self.source} holds a fit without numbers: there is nothing to predict from.")
         if not any(number.key == DAMPING for number in self.fit.numbers):
             raise FitError(f"{self.source} is not a fit of everting vines: it has no B to predict with.")
 
