@@ -5,6 +5,7 @@ figures by name; and `vt.fit`, `vt.diagnose`, `vt.power` and `vt.compare` for tr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
@@ -374,21 +375,17 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
     from vinetrack.pipeline.trials import draw_trial
 
+    if name == "trial_motion":
+        if trial not in (names := list(shown.trials["trial"])):
+            raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
+        stated = next((row for row in shown.experiment.trials if row.name == trial), None)
+        windows = read_json(shown._results.analysed(trial))["windows"]
+        return _with_content(draw_trial(shown._results, stated, trial, windows), name)
     trials: tuple[Trial, ...] = ()
-    try:
+    with suppress(Exception):  # without the sheet, the figures have simpler labels
         trials = shown.experiment.trials
-    except Exception as error:  # without the sheet, the figures have simpler labels
-        if name == "trial_motion":
-            raise ResultsError(f"{error}") from None
     tables = FigureTables(shown.folder, trials)
-    if name != "trial_motion":
-        return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))
-    names = list(shown.trials["trial"])
-    if trial not in names:
-        raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-    stated = next((row for row in trials if row.name == trial), None)
-    windows = read_json(tables.results.analysed(trial))["windows"]
-    return _with_content(draw_trial(tables.results, stated, trial, windows), name)
+    return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))
 
 
 # ------------------------------------------------------------------------------
