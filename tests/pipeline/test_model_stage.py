@@ -10,18 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from commanded import fit_law, succeed
+from explorer_campaign import make_results
 from lsoda_vine import small_campaign
 from test_pipeline import MODEL_HEADERS
 
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.registry import figures_of
 from vinetrack.laboratory import tracks
 from vinetrack.pipeline import planning_stage
-from vinetrack.pipeline.model_stage import fit_model
 from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
-from vinetrack.pipeline.stages import STAGES, Job
+from vinetrack.pipeline.stages import STAGES
 from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result
 
 TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m\n"
@@ -42,22 +41,15 @@ def write_experiment(folder: Path, pairs: Iterable[tuple[Trial, Track]], angles_
     return folder
 
 
-def fitted(experiment: Path, results: Path) -> dict:
-    """What the stage of the model writes, once those before it have run."""
-    succeed("trials", experiment, results)
-    fit_law(experiment, results, damping={"resamples": 200})
-    fit_model(Job(read_experiment(experiment), results, run_settings({})))
-    for name, header in MODEL_HEADERS.items():
-        assert (results / name).read_text(encoding="utf-8").startswith(header)
-    return read_json(results / "fit.json")
-
-
 def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_path):
     """Two vines, four pressures, two replicates, n = 0.4, and one broken track."""
     pairs, results = small_campaign(seed=21)[0], Results(tmp_path / "results")
     torn = replace(pairs[0][0], name="torn"), plain_track(np.zeros(1), np.zeros(1))
     experiment = write_experiment(tmp_path / "vines", [*pairs, torn])
-    content = fitted(experiment, results.folder)
+    make_results(experiment, results.folder)
+    for name, header in MODEL_HEADERS.items():
+        assert (results.folder / name).read_text(encoding="utf-8").startswith(header)
+    content = read_json(results.fit)
     assert content["refused"] is None
     assert {"spreads", "noise_m", "messages", "warnings", "covariance"} <= set(content)
     assert len(content["trials"]) == 16
