@@ -33,7 +33,7 @@ BUDGETS = {
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 29),
     "inference": (5646, 14, 51),
-    "interface": (570, 2, 2),
+    "interface": (567, 2, 2),
     "kinematics": (1665, 6, 12),
     "laboratory": (1600, 6, 9),
     "narrative": (1070, 3, 8),
