@@ -222,7 +222,7 @@ def result(**changes: object) -> dict[str, object]:
         "worst_at_s": 0.07,
         "worst_at_m": 0.123,
     }
-    compared = pd.DataFrame({"condition": ["c0", "c1"], "rms_position_m": [3e-3, 4e-3], "ratio": [3.0, 4.0], **at})
+    compared = pd.DataFrame({"condition": ["c0", "c1"], "rms_position_m": [3e-3, 4e-3], "n_trials": [3, 1], **at})
     check = {"vine": ["v"], "n_steady": 0.37, "n_trajectory": 0.49, "B_steady": 6.44, "B_trajectory": 6.1, "z": 5.1}
     return {"fit": FitSummary.from_json({**FIT, **changes}), "comparison": compared, "check": pd.DataFrame(check)}
 

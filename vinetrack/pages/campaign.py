@@ -17,7 +17,6 @@ from vinetrack.core.problems import UserError, reasons_told
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.ladder import rms_of
-from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.figures.registry import condition_label
@@ -89,7 +88,6 @@ class Campaign:
     trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
     highest_m: Mapping[str, float]
-    expected_m: tuple[float, ...]
     stored: FitSummary
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
@@ -150,7 +148,6 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         table = read_result(results.comparison).astype({"condition": str, "expected_high_m": float})
         highest_m = dict(zip(table["condition"], table["expected_high_m"], strict=True))
     compared = {name: read_result(results.trajectories(name)) for name in highest_m}
-    ladder = read_result(results.ladder)[EXPECTED].to_numpy(dtype=float).tolist() if results.ladder.exists() else []
     effects, unusable = {**catalogue(), **user_effects}, {}
     for effect in effects.values():
         try:
@@ -164,7 +161,6 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         highest_m=highest_m,
-        expected_m=tuple(ladder[0]) if ladder else (math.nan,) * 3,
         stored=stored,
         effects=effects,
         in_use=stored.names if stored.names and set(stored.names) <= set(effects) else tuple(experiment.settings.model),
@@ -196,12 +192,13 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction of every trial of a campaign, in its order, and by condition the root mean square error of
-    position, m.
+    """A model's prediction of every trial of a campaign, in its order, and the root mean square error of position, m, by
+    condition and in all.
     """
 
     trials: tuple[TrialFit, ...]
     errors_m: Mapping[str, float]
+    rms_m: float
 
 
 def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
@@ -216,13 +213,8 @@ def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
         data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
     predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
     members = {name: [predicted[i] for i in campaign.indices_of_condition(name)] for name in campaign.conditions}
-    return Prediction(tuple(predicted), {name: rms_of(trials) for name, trials in members.items()})
-
-
-def overall_m(errors: Mapping[str, float]) -> float:
-    """Return the root mean square over conditions with a known error, m; NaN if there are none."""
-    known = [error for error in errors.values() if math.isfinite(error)]
-    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
+    errors_m = {name: rms_of(trials) for name, trials in members.items()}
+    return Prediction(tuple(predicted), errors_m, rms_of(predicted))
 
 
 # ------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from vinetrack.effects import BASE_EFFECTS
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
-from vinetrack.narrative.verdict_text import Row, expected_text, quantity_text, spaced_name, verdict_table
+from vinetrack.narrative.verdict_text import Row, quantity_text, spaced_name, verdict_table
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -37,7 +37,6 @@ from vinetrack.pages.campaign import (
     SizeControl,
     fit_choice,
     model_text,
-    overall_m,
     predict_choice,
     read_campaign,
     sizes_of,
@@ -58,7 +57,7 @@ from vinetrack.pages.plots import (
     vine_colours,
 )
 from vinetrack.pipeline.workflow import command_for_results
-from vinetrack.report.build import TOKENS, next_experiment, tied_pairs
+from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
 # ------------------------------------------------------------------------------
@@ -68,16 +67,17 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 def headline(
     campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
 ) -> str:
-    """Return the error of the model now and as the page opened, and that of an adequate model, as a heading."""
-    now, before = (overall_m({} if one is None else one.errors_m) for one in (prediction, opened_with))
+    """Return the error of the model now and as the page opened, beside that of an adequate model, as a heading."""
+    now, before = ("" if one is None else _in_mm(one.rms_m) for one in (prediction, opened_with))
+    errors_m = {} if prediction is None else prediction.errors_m
+    highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
     words = model_text(choice.effects)
     return panel(
         "headline",
         model=words[:1].upper() + words[1:],
-        now=_in_mm(now),
-        before=_in_mm(before),
-        expected=expected_text(*campaign.expected_m),
-        exceeds=now > campaign.expected_m[-1],
+        now=now,
+        before=before,
+        beyond=beyond_adequate(errors_m.values(), highest_m),
         refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
@@ -91,7 +91,7 @@ def _in_mm(value_m: float) -> str:
 
 def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Number]) -> dict[str, str]:
     """Return effects, error and fitted parameters of a model in words."""
-    words = {"effects": model_text(choice.effects), "rms of position": _in_mm(overall_m(prediction.errors_m))}
+    words = {"effects": model_text(choice.effects), "rms of position": _in_mm(prediction.rms_m)}
     return words | {number.title: quantity_text(number) for number in numbers}
 
 
@@ -100,7 +100,7 @@ def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequ
     if not fits:
         return panel("numbers", compared=compared)
     fit = fits[-1].fit
-    ladder = [(model_text(each.choice.effects), _in_mm(overall_m(each.prediction.errors_m))) for each in fits]
+    ladder = [(model_text(each.choice.effects), _in_mm(each.prediction.rms_m)) for each in fits]
     return panel(
         "numbers",
         compared=compared,

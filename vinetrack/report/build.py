@@ -7,6 +7,7 @@ import contextlib
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -384,19 +385,24 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 # The section of the report that compares the model in use with the measurement.
 
 
+def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float]) -> str:
+    """In how many conditions the error is above the most that an adequate model would show, as the end of a sentence."""
+    known = [rms > high for rms, high in zip(rms_m, high_m, strict=True) if math.isfinite(high)]
+    return f"; in {sum(known)} of {len(known)} that is more than an adequate model would show" if known else ""
+
+
 def model_errors(table: pd.DataFrame) -> str:
-    """The position error of the model in two sentences, from `comparison.csv`; blank without a condition."""
+    """The position error of the model in two sentences, from `comparison.csv` with the numbers of trials; blank without
+    a condition.
+    """
     if not len(table):
         return ""
     worst = table.sort_values("rms_position_m").iloc[-1]
     conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
-    rms_m = math.sqrt(float((table["rms_position_m"] ** 2).mean()))
-    sentence = f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square)"
-    if known := int(np.isfinite(table["expected_m"]).sum()):
-        above = int((table["rms_position_m"] > table["expected_high_m"]).sum())
-        sentence += f"; in {above} of {known} that is more than an adequate model would show"
+    rms_m = math.sqrt(np.average(table["rms_position_m"] ** 2, weights=table["n_trials"]))
+    beyond = beyond_adequate(table["rms_position_m"], table["expected_high_m"])
     return (
-        f"{sentence}. Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum "
+        f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square){beyond}. Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum "
         f"after {number(1e3 * worst['worst_at_m'])} mm of growth."
     )
 
@@ -414,7 +420,8 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
     seen = {name: read_json(results.analysed(name)).get("calibration") for name in filmed}
-    sections = []
+    fit, comparison, sections = read_fit(results), read_result(results.comparison), []
+    fitted = Counter(trial.condition for trial in experiment.trials if trial.name in fit.trials)
     if experiment.settings.published:
         figures = _figures(tables, figures_of("paper").values())
         sections = [paper_section(tables.paper, tables.paper_departures, figures)]
@@ -430,8 +437,8 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "pictures": {name: _pictures(results, name) for name in drawn},
         "calibrations": {name: one for name, one in seen.items() if one},
         "clip": _clip(results, tables.diagnosed, trials),
-        "fit": read_fit(results),
-        "comparison": read_result(results.comparison),
+        "fit": fit,
+        "comparison": comparison.assign(n_trials=comparison["condition"].map(fitted)),
         "check": read_result(results.model_check),
         "diagnosis": diagnosis,
         "effects": known,
