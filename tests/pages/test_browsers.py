@@ -292,3 +292,20 @@ def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(pers
     assert person.chrome.run(names) == before[1]
     person.key("z", 90, modifiers=2)
     assert person.chrome.run(cells) == before[0]
+
+
+def test_another_unit_keeps_the_numbers_says_so_and_is_taken_back_by_ctrl_z(person):
+    select = "document.querySelector('#trials [aria-label=\"Unit of pressure\"]')"
+    cells = "[...document.querySelectorAll('#trials [data-quantity=pressure]')].map((field) => field.value)"
+    before = person.chrome.run(cells)
+    person.chrome.run(f"{select}.focus(), {select}.value = 'psi'")
+    for kind in ("input", "change"):
+        person.chrome.run(f"{select}.dispatchEvent(new Event('{kind}', {{bubbles: true}}))")
+    assert person.chrome.run(cells) == before
+    assert person.chrome.run("document.querySelectorAll('#pasted li.note').length") == 1
+    assert person.chrome.run(f"[{select}.value, document.activeElement === {select}]") == ["psi", True]
+    person.said('[id="trials.csv"]', "pressure_psi")
+    person.key("z", 90, modifiers=2)
+    assert person.chrome.run(f"{select}.value") == "kPa"
+    assert person.chrome.run(cells) == before
+    assert person.chrome.run("document.querySelectorAll('#pasted li').length") == 0

@@ -1,5 +1,5 @@
 // The motion: the strip along the axis with the tracked edge, the frame pointed at, and corrections.
-import {$, ask, changed, content, decimals, el, listed, listeners, round, state} from "./state.js";
+import {$, ask, changed, content, decimals, el, listed, listeners, problemsOf, round, state} from "./state.js";
 import {placesOf, row, showFrame, shownFrame} from "./picture.js";
 
 let [last, turn, corrected] = [null, 0, false];
@@ -24,8 +24,7 @@ export async function track(again = false) {
     if (mine === turn) show({...made, name, seconds: (performance.now() - begun) / 1000});
     if (mine === turn && again) point(shownFrame());
   } catch (error) {
-    const problems = error.content?.problems ?? [{severity: "error", text: error.message}];
-    if (mine === turn) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problems)));
+    if (mine === turn) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problemsOf(error))));
   }
   $("track").disabled = false;
 }
@@ -55,7 +54,6 @@ function show(made) {
   $("proofs").hidden = false;
 }
 
-let pending = 0;
 function point(i) {
   const made = last;
   if (!made || i < 0 || i >= made.flag.length) return;
@@ -64,8 +62,7 @@ function point(i) {
   if (made.edge_px[i] !== null) words.push(`edge at ${decimals(made.edge_px[i], 5)} px`, made.scaled ? `${decimals(made.position_mm[i], 5)} mm` : "");
   if (made.flag[i]) words.push(made.flag[i].replaceAll(";", ", ").replaceAll("_", " "));
   $("readout").textContent = words.filter(Boolean).join("; ");
-  cancelAnimationFrame(pending);
-  pending = requestAnimationFrame(() => showFrame(i, edgeAt(i)));
+  showFrame(i, edgeAt(i));
 }
 
 // The edge of a frame in the picture, and how it is moved: along the axis where it is, from one event to the next.
@@ -108,8 +105,7 @@ function correct(i, action, edge = null) {
   point(i);
 }
 
-const step = (by) => point(shownFrame() + by);
-const acts = {previous: () => step(-1), next: () => step(1)};
+const acts = {previous: () => point(shownFrame() - 1), next: () => point(shownFrame() + 1)};
 for (const action of ["confirm", "drop", "undo"]) acts[action] = () => correct(shownFrame(), action);
 for (const [id, act] of Object.entries(acts)) $(id).onclick = act;
 

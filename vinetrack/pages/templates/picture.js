@@ -237,8 +237,7 @@ function drag(event, words, put) {
     focusOn(words);
   };
   over.addEventListener("pointermove", move);
-  over.addEventListener("pointerup", end, {once: true});
-  over.addEventListener("pointercancel", end, {once: true});
+  over.addEventListener("lostpointercapture", end, {once: true});
 }
 
 function lens(event) {

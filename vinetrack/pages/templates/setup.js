@@ -1,5 +1,5 @@
 // Entry point of the page: load, handle events, check and save.
-import {$, ask, content, listed, listeners, settle, state} from "./state.js";
+import {$, ask, content, listed, listeners, problemsOf, settle, state} from "./state.js";
 import {drawOver, drawProblems, readCalibration, showRecording} from "./picture.js";
 import {drawTable, markProblems} from "./table.js";
 import {forget, track} from "./motion.js";
@@ -29,31 +29,23 @@ function showState() {
   $("save").disabled = !state.dirty;
 }
 
-let [turn, comparing] = [0, -1];
+let turn = 0;
 async function check(thorough = false) {
   const mine = ++turn;
   settle();
-  if (thorough) [comparing, $("status").textContent] = [mine, "Opening every recording …"];
-  try {
-    const found = await ask("api/check", content({thorough}));
-    if (mine !== turn) return;
-    comparing = -1;
-    state.problems = found.problems;
-    if (thorough) state.compared = true;
-    for (const [name, text] of Object.entries(found.texts)) {
-      $(name).textContent = text;
-      $(name).parentElement.hidden = !text;
-    }
-    showWhole([...markProblems(), ...found.notes.map((text) => ({severity: "note", text}))]);
-    $("understood").hidden = !found.understood.length;
-    $("understood").textContent = found.understood.join("\n");
-    showState();
-  } catch (error) {
-    if (mine !== turn) return;
-    state.problems = error.content?.problems ?? [];
-    showWhole(state.problems.length ? markProblems() : [{severity: "error", text: error.message}]);
-    showState();
+  if (thorough) $("status").textContent = "Opening every recording …";
+  const found = await ask("api/check", content({thorough})).catch((error) => ({problems: problemsOf(error), texts: {}, notes: [], understood: []}));
+  if (mine !== turn) return;
+  state.problems = found.problems;
+  if (thorough) state.compared = true;
+  for (const [name, text] of Object.entries(found.texts)) {
+    $(name).textContent = text;
+    $(name).parentElement.hidden = !text;
   }
+  showWhole([...markProblems(), ...found.notes.map((text) => ({severity: "note", text}))]);
+  $("understood").hidden = !found.understood.length;
+  $("understood").textContent = found.understood.join("\n");
+  showState();
   drawProblems();
 }
 
@@ -62,12 +54,10 @@ async function save() {
     const made = await ask("api/save", content());
     state.stamp = made.stamp;
     state.dirty = false;
-    // Results of the comparison with the recordings remain valid: saving changes nothing that was compared.
-    if (state.compared || turn === comparing) showState();
-    else await check();
+    showState(); // saving changes nothing that was checked
     $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "No changes"} · ${$("status").textContent}`;
   } catch (error) {
-    showWhole([{severity: "error", text: error.message}]);
+    showWhole(problemsOf(error));
   }
 }
 
@@ -76,7 +66,7 @@ async function begin() {
     Object.assign(state, await ask("api/state"));
   } catch (error) {
     $("headline").textContent = "This folder cannot be set up yet";
-    showWhole([{severity: "error", text: error.message}]);
+    showWhole(problemsOf(error));
     return;
   }
   state.dirty = state.unsaved;

@@ -26,13 +26,14 @@ export async function ask(path, body) {
   try {
     answer = await fetch(path, options);
   } catch {
-    throw Object.assign(new Error("The program has ended: start vinetrack setup again; nothing here is saved."), {gone: true});
+    throw new Error("The program has ended: start vinetrack setup again; nothing here is saved.");
   }
   const content = await answer.json().catch(() => ({}));
   if (!answer.ok) throw Object.assign(new Error(content.words || `The server returned status ${answer.status}.`), {content});
   return content;
 }
 
+export const problemsOf = (error) => error.content?.problems ?? [{severity: "error", field: "whole", text: error.message}];
 export const url = (path, given) => `${path}?${new URLSearchParams(given)}`;
 
 export const quantityOf = (name) => state.known[name]?.quantity ?? name;

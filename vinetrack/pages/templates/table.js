@@ -20,12 +20,21 @@ function head(columns) {
     const known = state.known[name];
     const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "Not a column of a trial sheet: kept, but ignored.";
     const unit = known && known.units.length > 1
-      ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
+      ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => correctUnit(name, event.target.value)},
         ...known.units.map((key) => el("option", {value: key, selected: name === `${known.quantity}_${key}`}, state.units[key])))
       : el("span", {class: "unit"});
     return el("th", {scope: "col"}, el("span", {title}, labelOf(name)), unit);
   });
   return el("thead", {}, el("tr", {}, el("td"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
+}
+
+// Who chooses a unit corrects what was typed.
+function correctUnit(name, unit) {
+  remember();
+  setUnit(name, unit);
+  const words = `${labelOf(name)}: the numbers stay as they were typed, and are ${state.units[unit]} now; Ctrl-Z takes that back.`;
+  $("pasted").replaceChildren(...listed([{severity: "note", text: words}]));
+  $("trials").querySelector(`[aria-label="Unit of ${quantityOf(name)}"]`).focus();
 }
 
 function setUnit(name, unit) {
@@ -106,6 +115,7 @@ function paste(event) {
 
 // The server says which cells a block changes. They are shown first, and Ctrl-Z takes the whole block back.
 let before = null;
+const remember = () => { before = structuredClone({sheet: state.sheet, shared: state.shared, kept: state.kept, offered: state.offered}); };
 async function propose(block, column, row) {
   const {rows, decimal} = state.sheet;
   const at_row = row === "shared" ? row : Number(row);
@@ -124,7 +134,7 @@ async function propose(block, column, row) {
   }));
   $("put-in").textContent = `Fill in ${cells.length} cells`;
   $("put-in").onclick = () => {
-    before = structuredClone({sheet: state.sheet, shared: state.shared, kept: state.kept, offered: state.offered});
+    remember();
     for (const name of new Set(cells.map((one) => one[1]))) {
       const shown = shownColumns().find((one) => quantityOf(one) === quantityOf(name)) ?? name;
       if (shown !== name) setUnit(shown, name.slice(quantityOf(name).length + 1));
