@@ -259,6 +259,12 @@ def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder):
     assert remedies == {"b": "did you mean d12_24kPa_2.MP4?", "c": "check the path and its upper and lower case"}
 
 
+def test_one_recording_of_two_trials_is_a_warning(folder):
+    for aside, named in (("", ["b"]), ("b", [])):
+        filmed(folder, {"a": "v.mp4", "b": "v.mp4"}, [], "capture_fps: 1000\n", aside)
+        assert [one.trial for one in read_experiment(folder).problems if one.code == "twice"] == named
+
+
 def test_a_recording_that_no_row_names_is_named(folder):
     files = ["a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4"]
     files += [f"burst/{i}.png" for i in range(5)]
@@ -266,7 +272,7 @@ def test_a_recording_that_no_row_names_is_named(folder):
     videos = {"a": "./a.mp4", "b": "left.mov"}
     filmed(folder, videos, files, "capture_fps: 1000\n" + target, aside="b")
     (problem,) = in_no_row(read_experiment(folder))
-    assert (problem.severity, problem.file, problem.column) == ("warning", "trials.csv", "video")
+    assert (problem.severity, problem.file, problem.column) == ("warning", "trials.csv", "")
     assert problem.message.endswith(" burst, day 2/extra.avi")
     filmed(folder, videos | {"c": "burst/0.png", "d": "day 2/extra.avi"}, files, "capture_fps: 1000\n" + target, "b")
     assert in_no_row(read_experiment(folder)) == []

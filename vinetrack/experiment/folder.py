@@ -116,13 +116,15 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     except ExperimentError as error:
         problems += error.problems
     rows = [read_row(table, i, settings or ExperimentSettings()) for i in range(len(table.rows))] if table else []
-    absent: set[str] = set()
+    absent = {"trial"} - set(table.columns) if table else set()
     in_use = [row for row in rows if row.in_use]
     for row in in_use:
         row.check()
         # A value that the sheet lacks may stand in the settings, so this needs readable settings.
         absent |= row.find_missing(folder, table.columns) if table and settings else set()
-    problems += [_absent_column(name) for name in COLUMNS if name in absent]
+    for name in filter(absent.__contains__, COLUMNS):
+        remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
+        problems.append(Problem("missing", "is missing", name, file=SHEET, remedy=remedy))
     corrections, faults = read_corrections(folder)
     problems += [*faults, *_unmatched(corrections, rows)]
     sheet_is_sound = not (_names_repeat(rows) or any(problem.severity == "error" for problem in problems))
@@ -172,7 +174,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     """Read the sheet as a table and check its columns."""
     remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
     if not folder.is_dir():
-        message = "is a file, not a folder" if folder.exists() else "does not exist"
+        message, remedy = ("is a file", "give its folder") if folder.exists() else ("does not exist", remedy)
         raise ExperimentError([Problem("no_folder", message, file=str(folder), remedy=remedy)])
     if not os.path.lexists(folder / SHEET):
         if close := closest_entry(folder / SHEET):
@@ -180,20 +182,17 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
         raise ExperimentError([Problem("missing", "is missing", file=SHEET, remedy=remedy)])
     table, found = read_sheet(folder / SHEET)
     problems += found
-    if "trial" not in table.columns:
-        problems.append(_absent_column("trial"))
     return table
 
 
-def _absent_column(name: str) -> Problem:
-    remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
-    return Problem("missing", "is missing", name, file=SHEET, remedy=remedy)
-
-
 def _names_repeat(rows: list[Row]) -> bool:
-    """Whether two rows have the same name, which is an error; names that differ only in case are a warning."""
-    repeat, seen = False, dict[str, Row]()
+    """Whether two rows have the same name, an error; names that differ in case only, and one recording, warn."""
+    repeat, seen = False, dict[object, Row]()
     for row in rows:
+        video, *part = (row.values.get(name) for name in ("video", "frames_used", "axis"))
+        if video and row.in_use and (other := seen.setdefault((video, *part), row)) is not row:
+            remedy = "name its own recording, or its part of one under frames_used"
+            row.add("twice", f"is that of {other.name} too", "video", "warning", remedy=remedy)
         first = seen.setdefault(row.name.lower(), row)
         if first.name != row.name:
             message = f"differs from {first.name!r} on line {first.line} in case only, which some file systems ignore"

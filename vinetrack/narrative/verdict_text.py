@@ -301,7 +301,7 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
     if UNEXPLAINED in (verdict, last):
         if diagnosis.not_tried:
-            return f"fill in what {listed_names(diagnosis.not_tried)} need in the sheet: they were not tried", ""
+            return f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}: not tried so far", ""
         table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
         if table is not None and (near := list(table["added"][table["partial"]])):
             return f"see what `vinetrack add {near[0]} RESULTS`, a part, leaves; then run `vinetrack propose`", told

@@ -192,8 +192,8 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction of every trial of a campaign, in its order, and the root mean square error of position, m, by
-    condition and in all.
+    """A model's prediction of every trial of a campaign, in its order, and the root mean square error of position by
+    condition and in all, m.
     """
 
     trials: tuple[TrialFit, ...]

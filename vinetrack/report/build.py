@@ -386,7 +386,7 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 
 
 def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float]) -> str:
-    """In how many conditions the error is above the most that an adequate model would show, as the end of a sentence."""
+    """In how many conditions the error is above the most of an adequate model, as the end of a sentence."""
     known = [rms > high for rms, high in zip(rms_m, high_m, strict=True) if math.isfinite(high)]
     return f"; in {sum(known)} of {len(known)} that is more than an adequate model would show" if known else ""
 
@@ -402,8 +402,9 @@ def model_errors(table: pd.DataFrame) -> str:
     rms_m = math.sqrt(np.average(table["rms_position_m"] ** 2, weights=table["n_trials"]))
     beyond = beyond_adequate(table["rms_position_m"], table["expected_high_m"])
     return (
-        f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square){beyond}. Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum "
-        f"after {number(1e3 * worst['worst_at_m'])} mm of growth."
+        f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square){beyond}. "
+        f"Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum after "
+        f"{number(1e3 * worst['worst_at_m'])} mm of growth."
     )
 
 

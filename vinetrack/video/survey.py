@@ -199,9 +199,9 @@ def in_no_row(experiment: Experiment) -> list[Problem]:
     if not found:
         return []
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-    message = f"names no trial for {', '.join(found[:5])}{more}"
+    message = f"has no row for {', '.join(found[:5])}{more}"
     remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
-    return [Problem("in_no_row", message, "video", file=SHEET, severity="warning", remedy=remedy)]
+    return [Problem("in_no_row", message, file=SHEET, severity="warning", remedy=remedy)]
 
 
 # ------------------------------------------------------------------------------
