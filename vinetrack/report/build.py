@@ -388,7 +388,7 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float]) -> str:
     """In how many conditions the error is above the most of an adequate model, as the end of a sentence."""
     known = [rms > high for rms, high in zip(rms_m, high_m, strict=True) if math.isfinite(high)]
-    return f"; in {sum(known)} of {len(known)} that is more than an adequate model would show" if known else ""
+    return f"; in {sum(known)} of {len(known)} conditions more than an adequate model would be" if known else ""
 
 
 def model_errors(table: pd.DataFrame) -> str:
