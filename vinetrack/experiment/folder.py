@@ -192,7 +192,7 @@ def _names_repeat(rows: list[Row]) -> bool:
         video, *part = (row.values.get(name) for name in ("video", "frames_used", "axis"))
         if video and row.in_use and (other := seen.setdefault((video, *part), row)) is not row:
             remedy = "name its own recording, or its part of one under frames_used"
-            row.add("twice", f"is that of {other.name} too", "video", "warning", remedy=remedy)
+            row.add("twice", f"is also the recording of {other.name}", "video", "warning", remedy=remedy)
         first = seen.setdefault(row.name.lower(), row)
         if first.name != row.name:
             message = f"differs from {first.name!r} on line {first.line} in case only, which some file systems ignore"

@@ -83,7 +83,7 @@ def read_sheet(folder: Path) -> Table:
     loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
     if loose or table.nameless:
         message = "has cells without a column, which would be lost"
-        remedy = "name their columns in the first line, or remove them"
+        remedy = "name their columns in the first line, remove them, or put decimal commas in quotes"
         raise _refusal(message, SHEET, remedy, line=loose[0] if loose else 1)
     return table
 

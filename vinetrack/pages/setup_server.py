@@ -320,9 +320,10 @@ def draft_problems(folder: Path, draft: files.Draft, thorough: bool = False) -> 
     with files.draft_folder(folder, draft) as copy:
         checked = check_folder(copy) if thorough else None
         problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
+    # What is noted, such as a unit, was chosen on the page.
+    told = [_problem_json(one, draft.sheet.columns) for one in problems if one.severity != "note"]
     return {
-        # What is noted, such as a unit, was chosen on the page.
-        "problems": [_problem_json(one, draft.sheet.columns) for one in problems if one.severity != "note"],
+        "problems": [one for i, one in enumerate(told) if one not in told[:i]],
         "notes": list(checked.notes) if checked else [],
         "understood": list(checked.recording_lines) if checked else [],
         "texts": draft.texts() | ({} if draft.corrections else {CORRECTIONS_FILE: ""}),
@@ -347,11 +348,12 @@ def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, An
     column = problem.column
     if column.split(".")[0] in ("calibration", "axis") and not problem.trial:
         field = column.split(".")[0]
-    elif problem.trial:
+    elif problem.trial and problem.file != SETTINGS:
         field = "cell" if column else "row"
     else:
         field = "shared" if files.column_of(column, COLUMNS) in COLUMNS else "whole"
-    told = {key: getattr(problem, key) for key in ("severity", "trial", "code", "of_a_measurement")}
+    told = {key: getattr(problem, key) for key in ("severity", "code", "of_a_measurement")}
+    told |= {"trial": problem.trial if field in ("cell", "row") else ""}
     return {**told, "field": field, "column": files.column_of(column, columns), "text": problem.reason}
 
 

@@ -176,7 +176,7 @@ function drawAdder(columns) {
 
 // Marks the cells with problems; returns the problems that no cell shows.
 export function markProblems() {
-  const placeless = [], measured = new Set();
+  const placeless = [], told = new Set();
   for (const cell of $("trials").querySelectorAll("td")) {
     cell.classList.remove("bad", "odd");
     cell.querySelectorAll("small.said").forEach((words) => words.remove());
@@ -195,8 +195,8 @@ export function markProblems() {
     if (blank && sharedValue(column)) continue;
     const cell = input.closest("td");
     cell.classList.add(severity === "error" ? "bad" : "odd");
-    const again = of_a_measurement && measured.has(`${severity} ${column}`);
-    if (of_a_measurement) measured.add(`${severity} ${column}`);
+    const alike = of_a_measurement ? `${severity} ${column}` : text, again = told.has(alike);
+    told.add(alike);
     const short = blank ? "to be filled in" : again ? "likewise" : text.replace(new RegExp(`^${column} `), "");
     cell.append(el("small", {class: `said ${severity}`, title: text}, short));
     input.setAttribute("aria-invalid", severity === "error");
