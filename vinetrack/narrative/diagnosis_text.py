@@ -279,7 +279,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
         errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
         cells = (f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)
         body.append((model, *cells, expected_text(*(row[name] for name in EXPECTED)) or "–"))
-    headings = ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm", "an adequate model")
+    headings = ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm", "adequate, left out")
     return list(table(body, headings, align="<>>>><"))
 
 
