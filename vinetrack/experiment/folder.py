@@ -172,11 +172,11 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     """Read the sheet as a table and check its columns."""
-    remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
     if not folder.is_dir():
-        message, remedy = ("is a file", "give its folder") if folder.exists() else ("does not exist", remedy)
+        message, remedy = ("is a file", "give its folder") if folder.exists() else tables.missing_file_message(folder)
         raise ExperimentError([Problem("no_folder", message, file=str(folder), remedy=remedy)])
     if not os.path.lexists(folder / SHEET):
+        remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
         if close := closest_entry(folder / SHEET):
             remedy = f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
         raise ExperimentError([Problem("missing", "is missing", file=SHEET, remedy=remedy)])
