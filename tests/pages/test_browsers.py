@@ -296,7 +296,6 @@ def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(pers
     person.chrome.run(f"{unit}.value = 'psi', {unit}.dispatchEvent(new Event('change'))")
     person.said("#pasted", "numbers stay")
     person.said('[id="trials.csv"]', "pressure_psi")
-    shown = person.chrome.run(f"{cells.replace('kPa', 'psi')}.concat(document.activeElement.value)")
-    assert shown == [*before[0], "psi"]
+    assert person.chrome.run(cells.replace("kPa", "psi")) == before[0]
     person.key("z", 90, modifiers=2)
     assert (person.chrome.run(f"{unit}.value"), person.chrome.run(cells)) == ("kPa", before[0])

@@ -13,9 +13,10 @@ import pytest
 from ruler_picture import ruler_picture
 from served import served_here
 
-from vinetrack.core.problems import ExperimentError
+from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import parse_yaml, read_table
 from vinetrack.pages import draft_files as draft
+from vinetrack.pages import setup_server
 from vinetrack.pages.local_page import PageServer
 from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, ruler_in, write_templates
 from vinetrack.video.axis import axis_through
@@ -253,6 +254,9 @@ def test_problems_name_their_field_in_the_unit_of_the_sheet_and_blanks_are_told_
         codes.setdefault(one["column"], set()).add(one["code"])
     assert codes["length_mm"] <= {"missing", "blank"}
     assert not codes["yield_pressure_kPa"] & {"missing", "blank"}
+    of_all = {"column": "capture_fps", "file": "experiment.yaml", "trial": "a"}
+    fields = [setup_server._problem_json(Problem(of_a_measurement=seen, **of_all))["field"] for seen in (False, True)]
+    assert fields == ["shared", "cell"]
 
 
 def test_a_new_folder_is_unsaved_and_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips):

@@ -348,7 +348,7 @@ def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, An
     column = problem.column
     if column.split(".")[0] in ("calibration", "axis") and not problem.trial:
         field = column.split(".")[0]
-    elif problem.trial and problem.file != SETTINGS:
+    elif problem.trial and (problem.of_a_measurement or problem.file != SETTINGS):
         field = "cell" if column else "row"
     else:
         field = "shared" if files.column_of(column, COLUMNS) in COLUMNS else "whole"
