@@ -6,7 +6,7 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from html import escape
@@ -87,12 +87,6 @@ def headline(
 
 def _in_mm(value_m: float) -> str:
     return f"{number(1e3 * value_m)} mm" if math.isfinite(value_m) else ""
-
-
-def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Number]) -> dict[str, str]:
-    """Return effects, error and fitted parameters of a model in words."""
-    words = {"effects": model_text(choice.effects), "rms of position": _in_mm(prediction.rms_m)}
-    return words | {number.title: quantity_text(number) for number in numbers}
 
 
 def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequence[tuple[str, str, str]]) -> str:
@@ -388,8 +382,10 @@ class Page:
         self._update_text()
 
     def _described(self, shown: Prediction) -> dict[str, str]:
-        fit = None if self._sizes_changed or self.last is None else self.last.fit
-        return described(self.choice, shown, () if fit is None else fit.numbers)
+        """Effects, error and fitted parameters of the model in words."""
+        numbers = () if self._sizes_changed or self.last is None else self.last.fit.numbers
+        words = {"effects": model_text(self.choice.effects), "rms of position": _in_mm(shown.rms_m)}
+        return words | {number.title: quantity_text(number) for number in numbers}
 
     @property
     def last(self) -> Evaluated | None:
