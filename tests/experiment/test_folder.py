@@ -253,10 +253,11 @@ def test_check_looks_at_videos_and_calls_who_can_open_them(folder):
 
 
 def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder):
-    videos = {"a": "d12_24kPa_1.mp4", "b": "d12_24kP_2.mp4", "c": "other.avi"}
-    filmed(folder, videos, ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"), "capture_fps: 1000\n")
+    videos = {"a": "d12_24kPa_1.mp4", "b": "d12_24kP_2.mp4", "c": "other.avi", "d": "x.mp4"}
+    filmed(folder, videos, ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "day/x.mp4"), "capture_fps: 1000\n")
     remedies = {problem.trial: problem.remedy for problem in check_experiment(folder) if problem.trial}
-    assert remedies == {"b": "did you mean d12_24kPa_2.MP4?", "c": "check the path and its upper and lower case"}
+    said = ("did you mean d12_24kPa_2.MP4?", "check the path and its upper and lower case", "did you mean day/x.mp4?")
+    assert remedies == dict(zip("bcd", said, strict=True))
 
 
 def test_one_recording_of_two_trials_is_a_warning(folder):

@@ -191,8 +191,7 @@ def test_a_missing_scale_is_said_with_what_to_do(tmp_path):
 @pytest.mark.slow
 def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
     """Of two trials, the second of which has a scale of its own."""
-    names = ("a.mp4", "b.mp4")
-    for name in names:
+    for name in (names := ("a.mp4", "b.mp4")):
         (tmp_path / name).symlink_to(clip)
     found = check(tmp_path, *names, settings=FILMED, header=f"{HEADER},mm_per_px", row=RIGHT + ",")
     assert found == []

@@ -518,7 +518,8 @@ def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
             return []
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", tables.missing_file_message(path)
-        if not path.is_symlink() and (close := closest_entry(path, named_videos)):
+        below = (f"{entry.parent.name}/{path.name}" for entry in path.parent.glob(f"*/{path.name}"))
+        if not path.is_symlink() and (close := closest_entry(path, named_videos) or next(below, "")):
             remedy = f"did you mean {close}?"
     except OSError as error:
         code, message, remedy = "unreadable", f"cannot be read: {error.strerror}", ""
