@@ -454,8 +454,8 @@ def reject_outliers(track: Track) -> Track:
     rejected = track.flagged(outlying, "rejected")
     around = track.time_s[rejected.usable], track.lead_position_m[rejected.usable]
     off_m = track.lead_position_m[outlying] - np.interp(track.time_s[outlying], *around)
-    places = [f"{at_s:.5g} s ({1e3 * off:+.2g} mm)" for at_s, off in zip(track.time_s[outlying], off_m, strict=True)]
-    return rejected.flagged([], "", f"far off the motion around, so left out: {', '.join(places)}")
+    places = [f"{1e3 * s:.5g} ms ({1e3 * m:+.2g} mm)" for s, m in zip(track.time_s[outlying], off_m, strict=True)]
+    return rejected.flagged([], "", f"points far off the motion around are left out: at {', '.join(places)}")
 
 
 def rejected_points_note(tracks: Mapping[str, Track]) -> str:
