@@ -189,11 +189,9 @@ def order_tolerance(n_times: int) -> float:
 #
 # A recording stopped by hand may hold thousands of frames of which tens or hundreds show the growth. A recording too
 # large for memory is sampled first: the key frames of a film, which can be decoded on their own, or every n-th frame
-# of other files. The event lasts from the first sample that differs from the initial pictures to the last that
-# differs from the final ones.
+# of other files. The event lasts from the last sample before pixels change for good to the first after it.
 
 MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
-MAX_SAMPLES = 400  # Maximum number of samples (chosen)
 MAX_SAMPLE_INTERVAL = 120  # Maximum number of frames from one sample to the next (chosen)
 MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
 
@@ -219,30 +217,12 @@ def event_range(pictures: list[NDArray[Any]], numbers: Indices, count: int) -> t
     """Return the first and last frame of the event, both and a margin included, from samples of the recording; None if
     nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
     """
-    if len(pictures) < 8:
+    fewest = 8  # Samples, and pixels that must have changed (chosen)
+    time = SmallPictures(np.stack(pictures)).changed.time.astype(int) if len(pictures) >= fewest else np.zeros(0, int)
+    if len(time) < fewest:
         return None
-    import cv2
-
-    # After blurring, values are no longer integers, so that medians resolve noise below one grey level.
-    blurred = np.stack([cv2.blur(picture.astype(np.float32), (3, 3)) for picture in pictures])
-    frames = SmallPictures(blurred).frames
-    # 40: pairs of samples from which the noise is estimated (chosen)
-    pairs = np.linspace(0, len(frames) - 2, min(40, len(frames) - 1)).astype(int)
-    noise = 1.4826 / np.sqrt(2) * np.median(np.abs(frames[pairs + 1] - frames[pairs]), axis=0)
-    # The median of three samples at either end shows the scene at rest.
-    first, last = (np.median(end, axis=0) for end in (frames[:3], frames[-3:]))
-    # 6.0, 4.5: change of a pixel that counts, in units of its noise (measured), and at least, grey levels (chosen)
-    limit = np.maximum(6.0 * np.maximum(noise, np.median(noise)), 4.5)
-
-    def differ(still: NDArray[np.float32]) -> Indices:
-        counts = [np.count_nonzero(np.abs(frame - still) > limit) for frame in frames]
-        return np.flatnonzero(np.array(counts) >= 8)  # pixels that must have changed (chosen)
-
-    differs_from_first, differs_from_last = differ(first), differ(last)
-    if not len(differs_from_first) or not len(differs_from_last):
-        return None
-    start = int(numbers[max(differs_from_first[0] - 1, 0)])
-    stop = int(numbers[min(max(differs_from_last[-1], differs_from_first[0]) + 1, len(numbers) - 1)])
+    time.sort()
+    start, stop = int(numbers[time[fewest - 1] - 1]), int(numbers[time[-fewest]])
     margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
     return max(start - margin, 0), min(stop + margin, count - 1)
 
@@ -250,7 +230,7 @@ def event_range(pictures: list[NDArray[Any]], numbers: Indices, count: int) -> t
 def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDArray[Any]], Indices]:
     """Every n-th frame, shrunk, and their numbers; of a film the key frames, unless these are too rare."""
     if (raw := recording.raw) is not None:
-        every = -(-len(raw.offsets) // MAX_SAMPLES)
+        every = -(-len(raw.offsets) // MAX_FRAMES)
         pictures = [_shrunk(picture) for picture in replace(raw, offsets=raw.offsets[::every]).pictures()]
         return pictures, every * np.arange(len(pictures))
     assert index is not None
@@ -258,7 +238,7 @@ def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDAr
     # Key frames so close to each other that no event fits between two of them
     keys_only = len(keys) > 1 and np.diff(keys, append=count).max() <= MAX_SAMPLE_INTERVAL
     candidates = keys if keys_only else np.arange(count)
-    chosen: dict[float, int] = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_SAMPLES)]}
+    chosen: dict[float, int] = {int(index.ticks[i]): int(i) for i in candidates[:: -(-len(candidates) // MAX_FRAMES)]}
     with quiet_log() as said:
         shots = film_shots(recording, said, chosen=chosen if keys_only else None)
         sampled = {chosen[shot.tick]: _shrunk(picture) for picture, shot in shots if shot.tick in chosen}
