@@ -1,13 +1,14 @@
 """Track a body that moves as a whole (travel ratio 1) by registering it against itself along the axis.
 
 The body leaves background behind it, perhaps dark on dark, so that there is no film to compare with. A template is cut
-where the body is most clearly visible, found in every frame by correlation, refined by robust least squares with gain
-and level free, and replaced by the median of the patches found. Each pixel of the template is weighted by the inverse
-of its variance from frame to frame: the body's own marks count much, background visible beside it little. The reported
-point is fixed on the body.
+where the body is most clearly visible, found in every frame by correlation, to a fraction of a pixel by the enhanced
+correlation coefficient, which ignores gain and level (Evangelidis & Psarakis, IEEE TPAMI 30, 1858, 2008), and replaced
+by the median of the patches found. The reported point is fixed on the body.
 """
 
 from __future__ import annotations
+
+import contextlib
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from vinetrack.video.point_quality import calibrated_sigma
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
-POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
+LEAST_MATCH = 0.6  # Correlation with the template below which the patch found is not the body (chosen)
 
 
 class BodyTracker(Tracker):
@@ -32,7 +33,7 @@ class BodyTracker(Tracker):
             return None
         strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
         pictures = strip.brightness()
-        path, half = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
+        path, half = _coarse_path(pictures, strip.noise, _near(pictures.shape[1], strip.axis.width_px))
         if np.isfinite(strip.axis.width_px):
             # A body is about as long as it is wide; a glint on it is shorter.
             half = max(half, round(0.75 * strip.axis.width_px))
@@ -44,23 +45,19 @@ class BodyTracker(Tracker):
         chosen = moving or whole.tolist() or [*range(len(path))]
         template_frame = int(chosen[len(chosen) // 2])
         template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
-        body_rows = _row_weights(template.shape[0], strip.axis.width_px)
-        weight = np.ones_like(template) * body_rows
-        place = np.column_stack([path, np.zeros(len(path))])
+        mask = np.broadcast_to(_near(len(template), strip.axis.width_px), template.shape).astype(np.uint8)
+        place, error, match = _registered(pictures, template, mask, _searched(pictures, template, path))
         # 3: times that the template is replaced by the median of the patches found (chosen)
-        for turn in range(3 + 1):
-            place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
-            if turn < 3:
-                template, weight = _median_template(pictures, place, match, half, strip.noise)
-                weight = weight * body_rows
+        for _ in range(3):
+            template = _median_template(pictures, place, match, half)
+            place, error, match = _registered(pictures, template, mask, place)
         inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
-        off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
-        # 0.4: correlation below which the patch found is not the body (chosen)
-        unseen = (match < 0.4) | off_axis
-        recognised, end = np.flatnonzero(~unseen & (match >= POOR_MATCH)), None
+        off_axis = np.abs(place[:, 1]) > 0.75 * SEARCH_ACROSS_PX
+        unseen, end = (match < LEAST_MATCH) | off_axis, None
+        recognised = np.flatnonzero(~unseen)
         if len(recognised) >= 3:
             # 3.0, 6.0: distance behind its furthest place where a body has turned back, px and standard errors (chosen)
-            back_px = np.maximum(3.0, 6.0 * np.nan_to_num(error[recognised], nan=0.0))
+            back_px = np.maximum(3.0, 6.0 * error[recognised])
             turned = turning_point(place[recognised, 0], back_px)
             last = int(recognised[-1 if turned is None else turned])
             unseen |= np.arange(len(unseen)) > last
@@ -74,10 +71,9 @@ class BodyTracker(Tracker):
                 "width"
             )
         edge = np.where(unseen, np.nan, place[:, 0])
-        # 20.0: largest factor on an error whose likelihood does not know the interpolation between pixels (measured)
         return Positions(
-            strip=strip, edge_px=edge, sigma_px=calibrated_sigma(edge, error, 20.0),
-            unsure=~inside | (match < POOR_MATCH), reach_px=float(half), slow_px=SLOW_PX, end=end,
+            strip=strip, edge_px=edge, sigma_px=calibrated_sigma(edge, error),
+            unsure=~inside, reach_px=float(half), slow_px=SLOW_PX, end=end,
             exposure_frames=look.exposure_frames,
         )  # fmt: skip
 
@@ -90,16 +86,12 @@ def hops_between_bodies(along: Floats, seen: Bools) -> bool:
     return len(places) >= 9 and rough_noise(places) > max(3.0, 0.5 * float(np.median(np.abs(np.diff(places)))))
 
 
-def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
-    """Weight of each row of the template, shape (n_rows, 1), falling outside the body, where a neighbour may move."""
-    if not np.isfinite(width_px):
-        return np.ones((rows, 1), dtype=np.float32)
-    outside = np.abs(np.arange(rows) - (rows - 1) / 2) - width_px / 2
-    # 2.0: distance beside the body's width at which a row counts half (chosen)
-    return (1 / (1 + (np.clip(outside, 0, None) / 2.0) ** 2)).astype(np.float32)[:, None]
+def _near(rows: int, width_px: float) -> Bools:
+    """Rows within the body's width and 2 px (chosen) beside it, where no neighbour moves, shape (n_rows, 1)."""
+    return ~(np.abs(np.arange(rows) - (rows - 1) / 2) > width_px / 2 + 2.0)[:, None]
 
 
-def _coarse_path(pictures: NDArray[np.float32], noise: float, rows: NDArray[np.float32]) -> tuple[Floats, int]:
+def _coarse_path(pictures: NDArray[np.float32], noise: float, near: Bools) -> tuple[Floats, int]:
     """Centre of the body by frame, to a few pixels, and half its length along the axis. The background is the median
     over frames spread evenly over the changes, so that a body that rests for long does not become part of it.
     """
@@ -111,7 +103,7 @@ def _coarse_path(pictures: NDArray[np.float32], noise: float, rows: NDArray[np.f
         np.searchsorted(cumulative, np.linspace(cumulative[0], cumulative[-1], min(n, 41))).clip(0, n - 1)
     )
     background = np.median(pictures[sampled], axis=0)
-    foreground = (rows * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
+    foreground = (near * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
     # Half the length of what differs from the background, from the width of its autocorrelation along the axis
     clearest = foreground[np.argsort(foreground.sum(axis=1))[n // 2 :]]
     clearest = clearest - clearest.mean(axis=1, keepdims=True)
@@ -138,85 +130,48 @@ def _patch(picture: NDArray[np.float32], along: float, across: float, half: int)
     return np.asarray(patch)
 
 
-def _register_all(
-    pictures: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32], place: Floats, half: int,
-    first: bool,
-) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+def _searched(pictures: NDArray[np.float32], template: NDArray[np.float32], path: Floats) -> Floats:
+    """Place of the best normalised correlation near a path, in whole pixels along and across, (n, 2)."""
+    import cv2
+
+    half, place = template.shape[1] // 2, np.zeros((len(path), 2))
+    reach = half + 14 + half // 2  # 14: distance along the axis searched about the expected place (chosen)
+    for t, picture in enumerate(pictures):
+        low = int(np.clip(path[t] - reach, 0, max(picture.shape[1] - 2 * half - 1, 0)))
+        score = cv2.matchTemplate(picture[:, low : low + 2 * reach + 1].copy(), template, cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        place[t] = low + column + half, row - SEARCH_ACROSS_PX
+    return place
+
+
+def _registered(
+    pictures: NDArray[np.float32], template: NDArray[np.float32], mask: NDArray[np.uint8], place: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Place (n, 2) along and across, its error along (n,) and correlation (n,) in every frame."""
     import cv2
 
-    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
-    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
-    # 14: distance along the axis searched about the expected place (chosen)
-    width, reach = template.shape[1], half + 14 + half // 2
+    place, match, half = place.copy(), np.full(len(place), 0.01), template.shape[1] // 2
+    until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-5
     for t, picture in enumerate(pictures):
-        guess = place[t]
-        low = int(np.clip(guess[0] - reach, 0, max(picture.shape[1] - width, 0)))
-        high = int(np.clip(guess[0] + reach + 1, low + width, picture.shape[1]))
-        if first and high - low >= width:  # whole-pixel place of the best normalised correlation
-            score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
-            row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-            guess = np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
-        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
-    return out, error, match
+        whole = np.rint(place[t])
+        patch = _patch(picture, whole[0], whole[1], half)  # not interpolated
+        with contextlib.suppress(cv2.error):  # where nothing is alike
+            found, warp = cv2.findTransformECC(
+                patch, template, np.eye(2, 3, dtype=np.float32), cv2.MOTION_TRANSLATION, until, mask, 1
+            )
+            match[t], place[t] = np.clip(found, 0.01, 1.0), whole - warp[:, 2]
+    seen = mask > 0
+    slope = np.linalg.norm(np.gradient(template, axis=1)[seen])
+    return place, np.std(template[seen]) * np.sqrt(match**-2 - 1) / slope, match
 
 
-def _register(
-    picture: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32],
-    slope_along: NDArray[np.float32], slope_across: NDArray[np.float32], guess: Floats, half: int,
-) -> tuple[Floats, float, float]:  # fmt: skip
-    """Gauss-Newton on place, gain and level with Cauchy weights 1/(1 + (r/3s)²). Returns the place, its error along the
-    axis and the correlation.
-    """
-    place = guess.astype(float).copy()
-    design = np.stack([slope_along, slope_across, template, np.ones_like(template)]).reshape(4, -1).astype(float)
-    flat = weight.ravel().astype(float)
-    robust = flat
-    # 8: most Gauss-Newton steps of a registration (chosen)
-    for _ in range(8):
-        patch = _patch(picture, place[0], place[1], half).ravel().astype(float)
-        weighted = design * robust
-        normal = weighted @ design.T + np.diag([1e-9, 1e-9, 1e-9, 1e-9])
-        solution = np.linalg.solve(normal, weighted @ patch)
-        residual = patch - solution @ design
-        scale_of_residuals = 1.4826 * float(np.median(np.abs(residual * np.sqrt(flat)))) + 1e-6
-        robust = flat / (1 + residual**2 * flat / (9 * scale_of_residuals**2))
-        gain = max(float(solution[2]), 0.1)
-        step = solution[:2] / gain
-        # patch(x) = gain · template(x + step): the body lies `step` behind the assumed place.
-        place -= np.clip(step, -2, 2)
-        place[1] = np.clip(place[1], -SEARCH_ACROSS_PX, SEARCH_ACROSS_PX)
-        if np.abs(step).max() < 2e-3:
-            break
-    inverse = np.linalg.pinv(normal)
-    variance = float(np.sum(robust * residual**2) / max(np.sum(robust > 0.2 * flat) - 4, 1))
-    sigma = float(np.sqrt(max(inverse[0, 0], 0.0) * variance)) / gain
-    model = solution[2] * design[2] + solution[3]
-    patch_deviation, model_deviation = patch - np.average(patch, weights=flat), model - np.average(model, weights=flat)
-    power = np.sqrt(np.sum(flat * patch_deviation**2) * np.sum(flat * model_deviation**2))
-    correlation = float(np.sum(flat * patch_deviation * model_deviation) / power) if power > 0 else 0.0
-    return place, sigma, correlation
-
-
-def _median_template(
-    pictures: NDArray[np.float32], place: Floats, match: Floats, half: int, noise: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Median of the patches found, and each pixel's weight: the inverse of its variance from frame to frame."""
+def _median_template(pictures: NDArray[np.float32], place: Floats, match: Floats, half: int) -> NDArray[np.float32]:
+    """Median of the patches found, each of unit variance."""
     whole = (place[:, 0] > 1.1 * half) & (place[:, 0] < pictures.shape[2] - 1 - 1.1 * half)
-    good = np.flatnonzero(whole & (match >= np.quantile(match, 0.3)))
+    good = np.flatnonzero(whole & (match >= LEAST_MATCH))
     if len(good) < 3:
         good = np.argsort(match)[-3:]
     good = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), 60)).astype(int))]
     stack = np.stack([_patch(pictures[t], place[t, 0], place[t, 1], half) for t in good])
-    first = np.median(stack, axis=0)
-    pattern = first - first.mean()
-    gains = np.einsum("tij,ij->t", stack, pattern) / float(np.sum(pattern**2) + 1e-9)
-    stack = stack / np.clip(gains, 0.3, 3.0)[:, None, None]
-    stack -= np.median(stack - first, axis=(1, 2), keepdims=True)
-    template = np.median(stack, axis=0).astype(np.float32)
-    scatter = (1.4826 * np.median(np.abs(stack - template), axis=0)) ** 2
-    # A glint varies by its slope times the misplacement: that is the signal of the registration, not noise.
-    slope = np.sum(np.square(np.gradient(template)), axis=0)
-    # 0.5: misplacement that the weights of the template allow for (chosen)
-    variance = np.maximum(scatter - 0.5**2 * slope, 0.0) + 2 * noise**2
-    return template, (1.0 / variance).astype(np.float32)
+    stack -= stack.mean(axis=(1, 2), keepdims=True)
+    return np.median(stack / stack.std(axis=(1, 2), keepdims=True), axis=0).astype(np.float32)

@@ -32,7 +32,7 @@ class PointQuality:
     without_edge: Bools
 
 
-def calibrated_sigma(edge_px: Floats, sigma_px: Floats, largest: float = 6.0) -> Floats:
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats) -> Floats:
     """Scale the stated errors to the roughness of the track in motion. Fourth differences cancel any cubic motion and
     have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard
     deviation; it stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px (n_frames,) → (n_frames,).
@@ -49,7 +49,7 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, largest: float = 6.0) ->
     if inside.sum() < 8:
         return sigma_px
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    return sigma_px * float(np.clip(factor, 0.5, largest))  # 0.5, 6.0: least and largest factor (chosen)
+    return sigma_px * float(np.clip(factor, 0.5, 6.0))  # 0.5, 6.0: least and largest factor (chosen)
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
