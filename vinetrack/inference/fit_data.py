@@ -18,8 +18,9 @@ from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, T
 from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
+    FOURTH_DIFFERENCE,
     Smoothing,
-    ar1_difference_gain,
+    ar1_sd,
     common_rounding_noise,
     detect_smoothing,
     noise_shape,
@@ -455,7 +456,7 @@ def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
         return data
     # One correlation for all trials, as in a fit: a single track with unequal noise hardly determines it.
     correlation = np.average([data[i].correlation for i in imported], weights=[data[i].time_s.size for i in imported])
-    gain = ar1_difference_gain(float(correlation))
+    gain = ar1_sd(FOURTH_DIFFERENCE, float(correlation)) / float(np.linalg.norm(FOURTH_DIFFERENCE))
     weighted = list(data)
     for i, sd_m in zip(imported, shape.sd_m, strict=True):
         typical_m = math.exp(float(np.mean(np.log(sd_m))))

@@ -20,7 +20,7 @@ from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.tracks.position_noise import rest_points
+from vinetrack.tracks.position_noise import ar1_sd, rest_points
 
 # ------------------------------------------------------------------------------
 # Release time and resting position of the leading edge: the zeros of time and position of a trial.
@@ -99,10 +99,8 @@ def flag_rest(track: Track, release: Release) -> Track:
 
 def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, float]:
     """Mean of the points at rest and its standard error under AR(1) noise."""
-    n, rho = position_m.size, kinematics.noise_correlation
-    lag = np.arange(1, n)
-    variance = (1 + 2 * float(np.sum((1 - lag / n) * rho**lag))) / n
-    return float(position_m.mean()), kinematics.noise_m * math.sqrt(variance)
+    mean = np.full(position_m.size, 1 / position_m.size)
+    return float(position_m.mean()), kinematics.noise_m * ar1_sd(mean, kinematics.noise_correlation)
 
 
 def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:

@@ -20,7 +20,7 @@ from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Tr
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.experiment.settings import SteadySettings
 from vinetrack.kinematics.force import TrialMotion, Window
-from vinetrack.kinematics.velocity import correlated
+from vinetrack.tracks.position_noise import ar1_sd
 
 # ------------------------------------------------------------------------------
 # Least squares over windows of raw positions with AR(1) noise: speed, drift and their standard errors.
@@ -60,15 +60,10 @@ class WindowMoments:
         # Error of a curvature under AR(1) noise over that under white noise
         weights = np.linspace(-1, 1, int(last[0] - first[0]) + 1) ** 2
         weights -= np.mean(weights)
-        gain = _ar1_sd(weights, self.correlation) / float(np.linalg.norm(weights))
+        gain = ar1_sd(weights, self.correlation) / float(np.linalg.norm(weights))
         with np.errstate(divide="ignore", invalid="ignore"):
             sigma = 4 * self.noise_m * gain * np.sqrt(a11 / determinant) / np.abs(slope)
             return slope / (half * self.unit_s), 4 * curve / slope, sigma
-
-
-def _ar1_sd(weights: Floats, rho: float) -> float:
-    """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance."""
-    return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
 
 
 def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
@@ -90,7 +85,7 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
     variance = float(np.sum(residual**2)) / max(n - order - 1, 1)
     if effective >= 2 and variance > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)):
         noise_m = math.sqrt(variance)
-    errors = [noise_m * _ar1_sd(row, rho) for row in rows]
+    errors = [noise_m * ar1_sd(row, rho) for row in rows]
     slope, curve, bend = (float(row @ y) for row in (*rows, 0 * u)[:3])
     bend = math.sqrt(max(bend**2 - errors[-1] ** 2, 0.0))  # P₃ moves the ends by 2 of its coefficient
     # d(c₂P₂)/du runs from −3c₂ to 3c₂

@@ -15,8 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from vinetrack.core.records import Floats, Indices, Kinematics, Track
-from vinetrack.core.threads import njit
-from vinetrack.tracks.position_noise import position_noise
+from vinetrack.tracks.position_noise import correlated, position_noise
 
 # ------------------------------------------------------------------------------
 # Local polynomials fitted to all windows of one width along a track at once.
@@ -112,24 +111,6 @@ def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
     inside = q[:, : order + 1]
     coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
     return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
-
-
-def correlated(weights: Floats, rho: float) -> Floats:
-    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis. w·(R·w) is the
-    variance of Σ w_i e_i for noise e of variance 1. Shapes: weights (…, n) → (…, n).
-    """
-    if rho == 0 or weights.size == 0:
-        return weights
-    both_ways = np.array([weights, weights[..., ::-1]])
-    _add_up(both_ways.reshape(-1, weights.shape[-1]), rho)
-    return both_ways[0] + both_ways[1, ..., ::-1] - weights
-
-
-@njit(nogil=True)
-def _add_up(rows: Floats, factor: float) -> None:  # scipy.signal.lfilter, which loads scipy.stats in a second
-    for row in rows:
-        for k in range(1, row.size):
-            row[k] += factor * row[k - 1]
 
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)

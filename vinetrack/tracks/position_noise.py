@@ -16,6 +16,7 @@ from itertools import accumulate, product
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
+from vinetrack.core.threads import njit
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -325,6 +326,29 @@ def _whitened_residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
     return np.sum(residual**2, axis=2), 2 * np.log(diagonal).sum(axis=2) - np.log(1 - RHO_GRID**2)[:, None]
 
 
+def correlated(weights: Floats, rho: float) -> Floats:
+    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis. w·(R·w) is the
+    variance of Σ w_i e_i for noise e of variance 1. Shapes: weights (…, n) → (…, n).
+    """
+    if rho == 0 or weights.size == 0:
+        return weights
+    both_ways = np.array([weights, weights[..., ::-1]])
+    _add_up(both_ways.reshape(-1, weights.shape[-1]), rho)
+    return both_ways[0] + both_ways[1, ..., ::-1] - weights
+
+
+@njit(nogil=True)
+def _add_up(rows: Floats, factor: float) -> None:  # scipy.signal.lfilter, which loads scipy.stats in a second
+    for row in rows:
+        for k in range(1, row.size):
+            row[k] += factor * row[k - 1]
+
+
+def ar1_sd(weights: Floats, rho: float) -> float:
+    """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance. Shapes: weights (n,)."""
+    return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
+
+
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
     """Draw stationary first-order autoregressive noise, as simulated tracks have it. Shape (count,)."""
     white = draw.standard_normal(count)
@@ -548,16 +572,6 @@ def noise_shape(
     # deviations of the noisiest and the quietest points differ by a quarter.
     ratio = max(float(np.quantile(sd, 0.95) / np.quantile(sd, 0.05)) for sd in shape.sd_m)
     return None if equal_noise - deviance < 28.0 or ratio < 1.25 else shape
-
-
-def ar1_difference_gain(rho: float) -> float:
-    """Ratio of the standard deviation of a fourth difference for AR(1) noise to that for white noise of the same size.
-    Var(aᵀe) = aᵀ C a with a the weights of the five points and C_jk = ρ^|j−k|.
-    """
-    steps = np.arange(FOURTH_DIFFERENCE.size)
-    covariance = rho ** np.abs(np.subtract.outer(steps, steps))
-    correlated, white = FOURTH_DIFFERENCE @ covariance @ FOURTH_DIFFERENCE, FOURTH_DIFFERENCE @ FOURTH_DIFFERENCE
-    return math.sqrt(float(correlated) / float(white))
 
 
 def _differences(time_s: Floats, position_m: Floats) -> _Differences:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
-from vinetrack.tracks.position_noise import rest_points
+from vinetrack.tracks.position_noise import FOURTH_DIFFERENCE, rest_points
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 
@@ -37,12 +37,11 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats) -> Floats:
     have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard
     deviation; it stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px (n_frames,) → (n_frames,).
     """
-    weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
         return sigma_px
     windows = np.lib.stride_tricks.sliding_window_view
-    difference = windows(edge_px, 5) @ weights
-    expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
+    difference = windows(edge_px, 5) @ FOURTH_DIFFERENCE
+    expected = np.sqrt(windows(sigma_px**2, 5) @ FOURTH_DIFFERENCE**2)
     # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
     use = (np.gradient(edge_px) > 0.3) & np.isfinite(edge_px)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
