@@ -18,6 +18,7 @@ from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import dividing_path
 from vinetrack.video.point_quality import calibrated_sigma
+from vinetrack.video.small_pictures import busy_frames
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
@@ -34,9 +35,7 @@ class BodyTracker(Tracker):
         strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
         pictures = strip.brightness()
         path, half = _coarse_path(pictures, strip.noise, _near(pictures.shape[1], strip.axis.width_px))
-        if np.isfinite(strip.axis.width_px):
-            # A body is about as long as it is wide; a glint on it is shorter.
-            half = max(half, round(0.75 * strip.axis.width_px))
+        half = max(half, round(0.75 * strip.axis.width_px))  # as long as it is wide; a glint on it is shorter
         if np.ptp(path) < 3:
             raise RecordingError("nothing moves along the axis")
         # Cut near the middle of the frames in which the whole body is inside and moving
@@ -95,17 +94,10 @@ def _coarse_path(pictures: NDArray[np.float32], noise: float, near: Bools) -> tu
     """Centre of the body by frame, to a few pixels, and half its length along the axis. The background is the median
     over frames spread evenly over the changes, so that a body that rests for long does not become part of it.
     """
-    n = len(pictures)
-    change = np.zeros(n)
-    change[1:] = np.abs(np.diff(pictures[:, ::2, ::2], axis=0)).clip(max=40).mean(axis=(1, 2))
-    cumulative = np.cumsum(np.clip(change - 1.2 * float(np.quantile(change, 0.1)), 0, None) + 1e-3)
-    sampled = np.unique(
-        np.searchsorted(cumulative, np.linspace(cumulative[0], cumulative[-1], min(n, 41))).clip(0, n - 1)
-    )
-    background = np.median(pictures[sampled], axis=0)
+    background = np.median(busy_frames(pictures, 41), axis=0)
     foreground = (near * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
     # Half the length of what differs from the background, from the width of its autocorrelation along the axis
-    clearest = foreground[np.argsort(foreground.sum(axis=1))[n // 2 :]]
+    clearest = foreground[np.argsort(foreground.sum(axis=1))[len(pictures) // 2 :]]
     clearest = clearest - clearest.mean(axis=1, keepdims=True)
     columns = foreground.shape[1]
     spectrum = np.abs(np.fft.rfft(clearest, n=2 * columns, axis=1)) ** 2

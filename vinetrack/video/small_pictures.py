@@ -115,18 +115,22 @@ def changed_pixels(small: NDArray[np.float32]) -> Pixels:
 
 
 def _busy_frames(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """At most MAX_FRAMES frames, spread evenly over the changes rather than over time; and the variance of the noise of
-    a pixel in them, at least that of quantisation.
-    """
-    if (n := len(small)) > MAX_FRAMES:
-        # Squares: a few pixels that change much are activity, many that change a little are noise.
-        activity = np.array([np.sqrt(np.mean((after - before) ** 2)) for before, after in pairwise(small)])
-        floor = float(np.quantile(activity, 0.2))
-        busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
-        total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
-        small = small[np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))]
+    """At most MAX_FRAMES busy frames, and the variance of a pixel's noise in them, at least that of quantisation."""
+    small = busy_frames(small, MAX_FRAMES)
     changes = np.abs(np.diff(small[:: max(1, len(small) // 30), ::2, ::2], axis=0)).ravel()
     return small, max(1.4826 * float(np.median(changes)) / np.sqrt(2), 0.7) ** 2
+
+
+def busy_frames(pictures: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+    """At most so many frames, spread evenly over the changes rather than over time."""
+    if (n := len(pictures)) <= most:
+        return pictures
+    # Squares: a few pixels that change much are activity, many that change a little are noise.
+    activity = np.array([np.sqrt(np.mean((after - before) ** 2)) for before, after in pairwise(pictures)])
+    floor = float(np.quantile(activity, 0.2))
+    busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
+    total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
+    return pictures[np.unique(np.searchsorted(total, np.linspace(0, total[-1], most)).clip(0, n - 1))]
 
 
 def _step_fraction(values: Floats, frame: Indices, noise_power: float) -> Floats:
