@@ -669,15 +669,7 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
         return axis_through(axis.points(ends_px, offsets), 2 * tube.half_px), float(np.abs(offsets).max())
     # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
-    places, middles, offsets = tube.places_px, tube.middles_px, np.empty(len(knots))
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
-        away = (places - place) / spacing
-        weight = np.exp(-0.5 * away**2)
-        design = np.column_stack([np.ones(len(places)), away])
-        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
-        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
+    offsets = np.interp(knots, tube.places_px, tube.middles_px)
     through = axis.points(knots, offsets)
     separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
     try:
