@@ -37,7 +37,7 @@ BUDGETS = {
     "kinematics": (1633, 6, 12),
     "laboratory": (1600, 6, 9),
     "narrative": (1070, 3, 8),
-    "pages": (2855, 7, 22),
+    "pages": (2845, 7, 22),
     "paper": (891, 4, 35),
     "pipeline": (1999, 7, 6),
     "planning": (1583, 4, 24),

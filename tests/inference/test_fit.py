@@ -583,7 +583,9 @@ def only_in_motion():
 
 
 def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
+    # 9; 56 where the release of a vine at steady speed, which nothing tells, refuses the steps of all.
     assert only_in_motion.converged
+    assert only_in_motion.iterations < 20
     assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
     assert only_in_motion["n"].sigma < 0.02
 
@@ -594,10 +596,8 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion,
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     own = solution.state.trial_effects.copy()
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
-    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
-    found = vt.refit(replace(only_in_motion, solution=elsewhere))
-    assert found.solution.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
-    assert np.isfinite(found["n"].sigma)
+    found = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
+    assert found.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
@@ -616,8 +616,9 @@ def test_columns_at_a_release_are_the_shifted_and_whitened_ones(rho):
 def test_a_fit_converges_from_its_own_solution(only_in_motion):
     """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4)
+    found = solve(predictor, solution.problem, solution.state, FixedTerms())
     assert found.converged
+    assert found.iterations <= 3
     far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
     assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()

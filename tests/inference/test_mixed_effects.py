@@ -27,7 +27,11 @@ def given(n_trials: int, count: int, keys: int, spread=1e-5, *, rho=RHO, sigma=S
     """A problem whose releases and origins are free, only B deviates and nothing has bounds or priors; its state."""
     own = {"has_deviation": np.tile([False, True], (n_trials, 1)), "gauge_error": np.zeros(n_trials)}
     own |= {"index": np.tile(np.arange(keys), (n_trials, 1)), "release_origin_mean": np.zeros((n_trials, 2))}
-    own |= {"points": np.full(n_trials, float(count)), "stretches": np.ones(n_trials)}
+    own |= {
+        "points": np.full(n_trials, float(count)),
+        "stretches": np.ones(n_trials),
+        "release_reach_s": np.full(n_trials, np.inf),
+    }
     own |= {"release_origin_precision": np.full((n_trials, 2), 1e-6)}
     shared = {name: np.zeros(keys) for name in ("prior_mean", "prior_precision")} | {"free": np.ones(keys, bool)}
     shared |= {"lower": np.full(keys, -np.inf), "upper": np.full(keys, np.inf), "random": np.zeros(keys, bool)}

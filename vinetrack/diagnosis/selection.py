@@ -125,8 +125,11 @@ class Search:
     def _fit_from_prediction(self, tests: MisfitTests, effects: Sequence[Effect], name: str) -> None:
         """Add an effect in its shapes of largest predicted gain, until one gains what is predicted."""
         self.report(f"fitting {name}")
-        for index in tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
-            shape, size = tests.products.shapes[index], float(tests.scores.size[index])
+        shapes, starts = tests.products.shapes, dict[tuple[float, ...], int]()
+        for index in tests.ranked_shapes(name):  # A size that differs between vines is fitted so from any start.
+            starts.setdefault(shapes[index].other_values, index)
+        for index in list(starts.values())[:STARTS_PER_EFFECT]:
+            shape, size = shapes[index], float(tests.scores.size[index])
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = [known for known in self.of_size(len(effects) + 1) if known.plausible and known.credible]
             best = max((known.fit.log_likelihood for known in credible), default=-math.inf)

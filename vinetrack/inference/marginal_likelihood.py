@@ -232,6 +232,7 @@ class MixedProblem:
     gauge_error: Floats
     release_origin_mean: Floats
     release_origin_precision: Floats
+    release_reach_s: Floats
     prior_mean: Floats
     prior_precision: Floats
     lower: Floats
@@ -249,8 +250,8 @@ class MixedProblem:
 
     def of_trials(self, trials: slice | NDArray[np.int_] | list[int]) -> MixedProblem:
         """The problem of some of the trials, with all its parameters."""
-        arrays = "index has_deviation gauge_error release_origin_mean release_origin_precision points stretches"
-        return replace(self, **{name: getattr(self, name)[trials] for name in arrays.split()})
+        arrays = "index has_deviation gauge_error release_reach_s release_origin_mean release_origin_precision points"
+        return replace(self, **{name: getattr(self, name)[trials] for name in (*arrays.split(), "stretches")})
 
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
@@ -386,7 +387,7 @@ def levenberg_marquardt_step(
     precision = trial_effect_prior(problem, state)[1]
     white = _with_prior_gradient(cross_products, problem, state)
     damped = precision + damping * (np.einsum("nkk->nk", white)[:, : problem.n_effects] + precision)
-    reduced, response = eliminated(white, damped)
+    reduced, response = eliminated(white, _held(damped, problem))
     of_keys = np.ascontiguousarray(white[:, problem.n_effects :, problem.n_effects :])
     undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
     square = information + np.diag(damping * np.diag(undamped[0]))
@@ -402,19 +403,24 @@ def levenberg_marquardt_step(
     return step, trial_effect_step, predicted_decrease
 
 
-def trial_effect_step(
-    cross_products: Floats, problem: MixedProblem, state: FitState, *, fixed_release: bool = False
-) -> Floats:
+def trial_effect_step(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
     """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
     (n_trials, 4).
     """
     white = _with_prior_gradient(cross_products, problem, state)
-    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
-    slope = white[:, :N_TRIAL_EFFECTS, -1:]
-    if fixed_release:
-        square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
-        square[:, RELEASE, RELEASE] = 1.0
-    return solve_per_trial(square, slope)[:, :, 0]
+    precision = _held(trial_effect_prior(problem, state)[1], problem)
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], precision)
+    return solve_per_trial(square, white[:, :N_TRIAL_EFFECTS, -1:])[:, :, 0]
+
+
+def _held(precision: Floats, problem: MixedProblem) -> Floats:
+    """Precisions of the trial effects by which a step of the release over its reach costs 1. Of a vine filmed at steady
+    speed alone nothing tells the release; a full step, far beyond its start or end, would spoil that of all trials.
+    `trial_effects.likelier_releases` searches further away. Shapes: precision (n_trials, n_effects).
+    """
+    held = precision.copy()
+    held[:, RELEASE] += 1 / problem.release_reach_s**2
+    return held
 
 
 def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:

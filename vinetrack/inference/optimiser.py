@@ -57,7 +57,8 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     )
     # 10.0, 10.0: prior standard deviations of release, frames, and of origin, in standard deviations of the noise
     # (chosen)
-    release_sd = np.where(rests, 10.0 * frames, 3 * durations)
+    reach = 10.0 * frames
+    release_sd = np.where(rests, reach, 3 * durations)
     # 1e-6: prior standard deviation of the release of a vine that was pressurised during the recording: it is
     # known (chosen)
     release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = 1e-6
@@ -70,6 +71,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
         gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
         release_origin_mean=np.where(release_known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
+        release_reach_s=reach,
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
         lower=lower,
@@ -247,9 +249,6 @@ def solve(
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
     damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
     columns, cross_products = _linearise(predictor, state)
-    # 5, 4: releases are searched every so many steps (along the valley between two of them steps become tiny), and how
-    # many of these searches may move one (chosen)
-    searches_left = 4
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
@@ -270,14 +269,14 @@ def solve(
         # At a corner of the cost, where a frame crosses the end of growth, only damped steps bring anything, or none.
         at_corner = decrease < least_decrease if damping > 0 else decrease <= 0
         small_step = predicted_decrease < least_decrease or at_corner
-        # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
-        if searches_left and (small_step or iteration % 5 == 0):
+        # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
+        # release far from the current one?
+        if small_step or iteration % 5 == 0:
             relocated = likelier_releases(predictor, problem, state)
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
-                searches_left, decrease = searches_left - 1, math.inf
+                decrease = math.inf
                 continue
-            searches_left = 0 if small_step else searches_left
         if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
             converged = predicted_decrease < far_decrease
             break

@@ -282,19 +282,8 @@ class Predictor:
         """Measured minus predicted positions of every trial. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
         (n_points,).
         """
-        return self.residuals_of_each(theta, [trial_effects])[0]
-
-    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
-        """As `residuals`, for several sets of trial effects, simulated in one call. Shapes: theta (n_free,);
-        effect_sets (n_trials, 4) → (n_points,).
-        """
-        count = len(self.data)
-        motions = self._simulated(Jobs.concatenated([self.jobs(theta, effects) for effects in effect_sets]))
-        observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(effect_sets))]
-        return [
-            self.by_trial(self._residuals(observed_of_set, effects))
-            for observed_of_set, effects in zip(observed_m, effect_sets, strict=True)
-        ]
+        motions = self._simulated(self.jobs(theta, trial_effects))
+        return self.by_trial(self._residuals(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects))
 
     def _residuals(self, observed_m: Floats, trial_effects: Floats) -> Floats:
         """Measured minus predicted positions of all trials, concatenated."""

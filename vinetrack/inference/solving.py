@@ -68,6 +68,7 @@ from vinetrack.inference.sensitivity import (
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset
 
 ALIKE = (5e-4, 1e-3)  # Between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
+STEPS_TO_TELL = 4  # Steps by which it shows whether a fit stays poor (chosen)
 
 
 def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None) -> Solution:
@@ -96,8 +97,7 @@ def solve_from(
     if (rows := _part(predictor)).size:
         state, poor = _solved_for_part(predictor, problem, state, fixed_terms, rows, **how)
         if poor:  # It only has to be ruled out.
-            # 4: steps with all trials of a fit that is poor with some of them (chosen)
-            fixed_terms, how = replace(fixed_terms, spread=ALIKE), how | {"most_iterations": 4}
+            fixed_terms, how = replace(fixed_terms, spread=ALIKE), how | {"most_iterations": STEPS_TO_TELL}
     return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
 
 
@@ -140,15 +140,18 @@ def _solve_or_alike(
 ) -> Solution:
     """Solve, and where the fit is poor, unless it is to be tried `once`, with trials that are alike: differences
     between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials may differ
-    again, if that leads near the tracks.
+    again, if a few steps of that lead near the tracks.
     """
     solution = solve(predictor, problem, state, fixed_terms, **how)
     if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
         return solution
     try:
         alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
-        solution = solve(predictor, problem, alike.state, fixed_terms, **how)
-        return alike if is_poor_fit(predictor, solution) else solution
+        differing = replace(alike.state, spread=state.spread)
+        solution = solve(predictor, problem, differing, fixed_terms, most_iterations=STEPS_TO_TELL)
+        if is_poor_fit(predictor, solution):
+            return alike
+        return solve(predictor, problem, solution.state, fixed_terms, **how)
     except SimulationError:
         return solution
 

@@ -139,21 +139,12 @@ def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: F
     to it. Returns state, costs. Shape (n_trials,).
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-    cross_products = predictor.products(columns)
-    steps = (trial_effect_step(cross_products, problem, state, fixed_release=fixed) for fixed in (False, True))
-    current_costs = trial_costs(predictor, problem, state, residuals_in(columns))
-    moved = [moved_effects(state.trial_effects, step) for step in steps]
-    candidates = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved)]
-    residuals_of_candidates = zip(candidates[1:], predictor.residuals_of_each(state.theta, moved), strict=True)
-    costs = np.array(
-        [
-            current_costs,
-            *(trial_costs(predictor, problem, candidate, left_m) for candidate, left_m in residuals_of_candidates),
-        ]
-    )
-    best = np.argmin(costs, axis=0)
-    trial_effects = np.array([candidates[candidate].trial_effects[i] for i, candidate in enumerate(best)])
-    return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
+    step = trial_effect_step(predictor.products(columns), problem, state)
+    moved = replace(state, trial_effects=moved_effects(state.trial_effects, step))
+    costs = trial_costs(predictor, problem, state, residuals_in(columns)), trial_costs(predictor, problem, moved)
+    better = costs[1] < costs[0]
+    trial_effects = np.where(better[:, None], moved.trial_effects, state.trial_effects)
+    return replace(state, trial_effects=trial_effects), np.where(better, costs[1], costs[0])
 
 
 def moved_effects(trial_effects: Floats, step: Floats) -> Floats:
