@@ -381,6 +381,7 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
+LEAST_AMPLITUDE = 0.6  # Contrast, relative to that of other frames, below which too little is visible (chosen)
 NO_EDGE_PX = 2 * ASTRAY_PX  # Standard error stated where there is no edge
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
@@ -431,12 +432,16 @@ def _near_start(edge: Floats) -> Bools:
     return np.asarray(edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX)
 
 
-def hidden_errors(misfit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
-    picture differs from the model, there is no edge. Shapes: misfit, misfit_ratio, edge (n_frames,) → (n_frames,).
+    picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
+    6); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
+    misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 2.4, 1.6: misfit, over the usual one and in itself, above which a frame differs from those clear of the start
-    covered = _near_start(edge) & (misfit_ratio > 2.4) & (misfit > 1.6)
+    # (chosen); 3.6: misfit in itself, above which an object stands in front of the tip (chosen)
+    unusual = _near_start(edge) & (misfit_ratio > 2.4) & (misfit > 1.6)
+    covered = unusual & ((misfit > 3.6) | (amplitude < LEAST_AMPLITUDE))
     guess = np.zeros(len(edge))
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
@@ -716,11 +721,11 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     column = np.clip(np.rint(edge_now), tube.passed[0], tube.passed[1] - 1).astype(int)
     shared = 1.0 / np.maximum(contrast[column], 1.0)
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
-    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit[:, 2], ratio, edge_now))
+    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
     slow = np.sqrt(unseen**2 + shared**2 + guess**2)
-    # 1.3: misfit over the usual one above which a frame near the start is doubtful; 0.6, 1.5: amplitudes (relative
-    # contrast) below and above which any is: little of the edge is visible, or something adds to it (chosen)
-    odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < 0.6 - 1) | (fit[:, 3] > 1.5 - 1)
+    # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
+    # above which any is, since something adds to the edge (chosen)
+    odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
     # 1.0: standard error above which a point is doubtful, px (chosen)
     uncertain = np.hypot(sigma, slow) > 1.0
     return Positions(
