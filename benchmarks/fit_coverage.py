@@ -121,7 +121,7 @@ def measure_drops(seed: int) -> dict[str, object]:
         speed = np.sqrt(2 * 0.02 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag))
         fallen_m = speed**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * time_s / speed))
         pairs.append((trial, _as_track(time_s, fallen_m + draw.normal(0, 2e-3, time_s.size))))
-    fit = vt.fit(model, pairs, profile=False)
+    fit = vt.fit(model, pairs)
     return {"count": count, "scatter": scatter, **_held_against(fit, {"air_drag.C_D": DROP_DRAG})}
 
 

@@ -108,7 +108,7 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     law = list(LAWS)[seed % len(LAWS)]
     campaign = make(f"outsider:{law}", seed)
     pairs, begun = list(campaign.pairs), time.process_time()
-    fit = initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), None, {}), profile=False)
+    fit = initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), None, {}))
     learned = missing_force(fit).learned
     row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
     row["processor_s"] = time.process_time() - begun

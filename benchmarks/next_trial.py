@@ -111,7 +111,7 @@ def asked_for(found: NextExperiment, like: Trial) -> list[Trial]:
 def fitted(pairs: Sequence[tuple[Trial, Track]], tie: Tie, before: Sequence[Fit] = ()) -> list[Fit]:
     """The true hypothesis and the other, each from nothing and from where it was before."""
     host = vt.make_model([*BASE_EFFECTS, tie.effect, tie.other])
-    base = vt.fit(vt.base_model(), pairs, profile=False, host=host)
+    base = vt.fit(vt.base_model(), pairs, host=host)
     found = []
     for k, name in enumerate((tie.effect, tie.other)):
         model = base.model + getattr(vt.effects, name)

@@ -67,7 +67,7 @@ def measure(kind: str, seed: int, trials: int | None, count: int) -> Iterator[di
         models["true"] = vt.make_model([*vt.base_model().names, *effects])
     for name, model in models.items():
         try:
-            fit = vt.fit(model, rest[:trials], profile=False)
+            fit = vt.fit(model, rest[:trials])
             predicted = vt.predict(fit, [pair for pair in left if pair[0].vine in known])
         except (vt.FitError, vt.EffectError) as error:
             print(f"{kind} {seed}, {name}: {error}")
@@ -85,7 +85,7 @@ def real(folder: Path) -> Iterator[dict[str, object]]:
         tubes, _ = pairs_of(vt.read_experiment(write_folder(recordings, Path(scratch) / "tubes")))
     for kind, model, pairs in (("cups", drag, cups), ("tubes", vt.base_model(), tubes)):
         for k, pair in enumerate(pairs):
-            fit = vt.fit(model, [*pairs[:k], *pairs[k + 1 :]], profile=False)
+            fit = vt.fit(model, [*pairs[:k], *pairs[k + 1 :]])
             yield {"kind": kind, "model": "all others", **row(vt.predict(fit, [pair])[0])}
     for pair in tubes:
         own = [one for one in tubes if tube_of[one[0].name] == tube_of[pair[0].name] and one is not pair]

@@ -72,7 +72,7 @@ def measure(seed: int) -> list[dict[str, object]]:
         seed=seed,
     )
     grown = grow(sheet(), nature)
-    numbers = FitNumbers(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown], profile=False))
+    numbers = FitNumbers(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown]))
     rows = []
     for k, (name, trial) in enumerate(unseen().items()):
         inputs = predictive_inputs(

@@ -44,7 +44,7 @@ def cups() -> None:
     model = vt.make_model(["gravity", "air_drag"])
     print("all cups", sized(vt.fit(model, pairs)["C_D"]))
     for k, pair in enumerate(pairs):
-        others = vt.fit(model, pairs[:k] + pairs[k + 1 :], profile=False)
+        others = vt.fit(model, pairs[:k] + pairs[k + 1 :])
         missed = rms_mm(vt.predict(others, [pair])[0])
         alone = sized(vt.fit(model, [pair])["C_D"])
         print(
@@ -74,7 +74,7 @@ def tubes() -> None:
     for tube in sorted(set(tube_of.values())):
         both = [pair for pair in pairs if tube_of[pair[0].name] == tube]
         for k, pair in enumerate(both):
-            fit = vt.fit(model, [pair], profile=False)
+            fit = vt.fit(model, [pair])
             said = ", ".join(sized(number) for number in fit.numbers)
             missed = rms_mm(vt.predict(fit, [both[1 - k]])[0])
             print(f"{pair[0].name}: {rms_mm(fit.trials[0]):.0f} mm off, the other trial {missed:.0f} mm; {said}")

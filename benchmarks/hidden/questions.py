@@ -166,7 +166,7 @@ def ask_bic(kind: str, seed: int, scatter: bool = True) -> Row:
     plain = {} if scatter else {"spreads": (1e-6, 1e-6), "noise": (_rest_noise_m(campaign), 0.0)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        base = vt.fit(vt.base_model(), campaign.pairs, profile=False, **plain)
+        base = vt.fit(vt.base_model(), campaign.pairs, **plain)
         points = sum(trial.time_s.size for trial in base.trials)
         scores, chi2 = {"": _bic(base, points)}, {}
         for effect in catalogue().values():

@@ -134,7 +134,7 @@ def _best(
     followed: list[tuple[Fit, tuple[TrialFit, ...]]] = []
     for start in starts(model, [one for one in recordings if one.name in vines], vines):
         try:
-            fit = vt.fit(model, pairs, shared=shared, start=start, profile=False)
+            fit = vt.fit(model, pairs, shared=shared, start=start)
             predicted = in_sample(fit).trials
             # A trial that the fit cannot be integrated through would make it look better than one that can.
             if len(predicted) < len(pairs):

@@ -156,7 +156,7 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day_and_known_to
     assert 0.03 < abs(second.value) < 0.09
     assert second.sigma < 0.01
     # A band around a prediction takes over the error of the number of its day.
-    fitted_by_day = vt.fit(vt.base_model() + "time_base", of_two_days, profile=False)
+    fitted_by_day = vt.fit(vt.base_model() + "time_base", of_two_days)
     pairs = [pair for pair in fitted_by_day.pairs if pair[0].day == "2"]
     known = vt.predict(fitted_by_day, pairs)
     unknown = vt.predict(fitted_by_day, [(replace(trial, day=""), track) for trial, track in pairs])
@@ -421,7 +421,7 @@ def test_a_measured_pressure_already_holds_what_happens_in_the_chamber():
 
 @pytest.fixture(scope="module")
 def plain():
-    return vt.fit(vt.base_model(), grown(seed=51), profile=False)
+    return vt.fit(vt.base_model(), grown(seed=51))
 
 
 def test_an_effect_that_predicts_no_condition_better_is_said_to():

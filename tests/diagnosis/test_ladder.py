@@ -47,7 +47,7 @@ def pairs():
 
 @pytest.fixture(scope="module")
 def fits(pairs):
-    before = vt.fit(vt.base_model(), pairs, profile=False)
+    before = vt.fit(vt.base_model(), pairs)
     return before, vt.refit(before, before.model + vt.effects.reservoir_depletion)
 
 
@@ -63,7 +63,7 @@ def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits
     # The model that the vines were grown with, no number of it fitted.
     truth = fits[1].model.with_values(damping_values([trial for trial, _ in pairs]) | {f"{DEPLETION}.gamma": 1.4})
     held = ["eversion_damping.B", "eversion_damping.n", f"{DEPLETION}.gamma", "P_y"]
-    known = in_sample(vt.fit(truth, pairs, fixed=held, profile=False)).rms_m
+    known = in_sample(vt.fit(truth, pairs, fixed=held)).rms_m
     assert after["rms_left_out_m"] < 1.25 * known
     assert before["excess_left_out_m"] > 1.5 * after["excess_left_out_m"]
     assert table.attrs["notes"] == []
@@ -74,9 +74,9 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs)
     """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
     one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]
     model, predicted = vt.base_model() + "reservoir_depletion", []
-    found = vt.fit(model, one_vine, profile=False)
+    found = vt.fit(model, one_vine)
     for condition in dict.fromkeys(trial.condition for trial, _ in one_vine):
-        others = vt.fit(model, [pair for pair in one_vine if pair[0].condition != condition], profile=False)
+        others = vt.fit(model, [pair for pair in one_vine if pair[0].condition != condition])
         unseen = prepared_pairs([pair for pair in one_vine if pair[0].condition == condition])
         predicted += predict_prepared(others, unseen, from_rest=True)
     by_hand = Errors(tuple(predicted), {}).rms_m
@@ -134,7 +134,7 @@ def test_an_error_of_the_lens_which_trials_share_has_the_freedom_of_its_four_pol
 @pytest.mark.slow
 def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(pairs):
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
-    found = vt.fit(vt.base_model(), lower, profile=False)
+    found = vt.fit(vt.base_model(), lower)
     assert sorted(one.trial.name for one in left_out(found).trials) == sorted(trial.name for trial, _ in lower)
     assert sorted(one.trial.name for one in highest_pressure(found).trials) == ["R2_48kPa_1", "R4_38kPa_1"]
     # Without replicates there is no floor.
@@ -145,7 +145,7 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
 @pytest.mark.slow
 def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
     single = [pair for pair in pairs if pair[0].name.startswith("R2") or "_38kPa" in pair[0].name]
-    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single, profile=False)
+    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single)
     table = ladder([found], [""])
     assert len(left_out(found).not_predicted) == 3
     assert math.isfinite(table["rms_left_out_m"].iloc[0])
@@ -175,7 +175,7 @@ def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(f
 
 
 def test_of_a_single_condition_nothing_can_be_left_out(pairs):
-    found = vt.fit(vt.base_model(), pairs[:3], fixed=["n"], profile=False)
+    found = vt.fit(vt.base_model(), pairs[:3], fixed=["n"])
     table = ladder([found], [""])
     assert math.isfinite(table["rms_in_sample_m"].iloc[0])
     assert math.isnan(table["rms_left_out_m"].iloc[0])
@@ -187,7 +187,7 @@ B = "eversion_damping.B"
 
 
 def fitted(pairs: Pairs):
-    return vt.fit(vt.base_model(), pairs, profile=False)
+    return vt.fit(vt.base_model(), pairs)
 
 
 def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
@@ -327,7 +327,7 @@ def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_devi
     forms = partial(between_trials.of_column, **{sd: 0.03})
     monkeypatch.setitem(between_trials.BETWEEN, "day", between_trials.BetweenHypothesis("days differ", "again", forms))
     known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
-    found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9), profile=False))
+    found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9)))
     assert [len(each.terms) for each in found if each.name == "day"] == [1]
 
 
@@ -335,7 +335,7 @@ def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_devi
 def test_the_best_of_many_places_is_no_more_than_chance(trials):
     """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""
     pairs = made(trials, [1.0] * len(trials), seed=9)
-    among = {difference.name: difference for difference in differences(fit(vt.base_model(), pairs, profile=False))}
+    among = {difference.name: difference for difference in differences(fit(vt.base_model(), pairs))}
     drift = among["order_drift"]
     assert drift.n_forms >= 3
     assert drift.penalised_gain == pytest.approx(drift.gain - 2 * np.log(drift.n_forms))
@@ -347,7 +347,7 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
     """It decides nothing where the sheet states no order; but B and n hold it, and a reader must know."""
     pairs = made(trials, [1 + 0.01 * seen for seen in uses(trials)], seed=11)
     unstated = [(replace(trial, order=np.nan), track) for trial, track in pairs]
-    apart = significant(differences(fit(vt.base_model(), unstated, profile=False)), 0.003)
+    apart = significant(differences(fit(vt.base_model(), unstated)), 0.003)
     assert "order_drift" in {difference.name for difference in apart}
     assert not any(difference.stated for difference in apart)
     result, _ = diagnosed(unstated, ("air_drag",))
@@ -380,7 +380,7 @@ def test_exponents_that_differ_by_vine_are_named(trials):
 @pytest.fixture(scope="module")
 def questioned(trials):
     """B rises by 2 % with every use of a tube, pressures in rising order."""
-    return fit(vt.base_model(), made(trials, [1 + 0.02 * seen for seen in uses(trials)], seed=1), profile=False)
+    return fit(vt.base_model(), made(trials, [1 + 0.02 * seen for seen in uses(trials)], seed=1))
 
 
 def test_the_linear_estimate_is_what_the_refit_gains(questioned):

@@ -121,7 +121,7 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
 
 def test_a_step_that_leaves_a_trial_without_points_leads_where_nothing_can_be_computed(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
-    problem = inversion.ForceProblem(vt.fit(vt.base_model(), pairs, profile=False))
+    problem = inversion.ForceProblem(vt.fit(vt.base_model(), pairs))
     domain = learning.candidate_domains(problem.start.motions)[0]
     late = replace(problem.start, trial_effects=problem.start.trial_effects - [0.0, 1.0, 0.0, 0.0])
     with pytest.raises(np.linalg.LinAlgError):
@@ -130,7 +130,7 @@ def test_a_step_that_leaves_a_trial_without_points_leads_where_nothing_can_be_co
 
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
-    slowed = inversion.ForceProblem(vt.fit(vt.base_model(), pairs, profile=False))
+    slowed = inversion.ForceProblem(vt.fit(vt.base_model(), pairs))
     tracks, theta = slowed.start, slowed.start.theta
     domains = learning.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))
@@ -163,7 +163,7 @@ def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_p
 
 def missing_from(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
-    return missing_force(vt.fit(vt.base_model(), pairs, profile=False))
+    return missing_force(vt.fit(vt.base_model(), pairs))
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_a_rough_patch_is_learned_where_it_is_in_every_condition_and_is_no_simpl
 @pytest.mark.slow
 def test_nothing_is_learned_about_tracks_along_which_the_model_is_unstable():
     """Two of forty trials would move by 10^6 times their growth if their pressures deviated as usual."""
-    fit = vt.fit(vt.base_model(), list(make("outsider:squeeze", 40001).pairs), profile=False)
+    fit = vt.fit(vt.base_model(), list(make("outsider:squeeze", 40001).pairs))
     assert missing_force(fit).learned is None
 
 
@@ -196,7 +196,7 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
     """With a much tighter integrator tolerance than usual, because a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
-    found = vt.fit(model, pairs_of(virtual), profile=False)
+    found = vt.fit(model, pairs_of(virtual))
     own = align_trials(found).trial_effects
     motions = inversion.motions_of(found, own)
     shapes = {

@@ -34,7 +34,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
 
 def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST):
     candidates = ladder.candidates_of(model, None, None)
-    found = vt.fit(model, pairs, host=ladder.host_for(model, candidates), profile=False)
+    found = vt.fit(model, pairs, host=ladder.host_for(model, candidates))
     return questions.misfit_tests(found, questions.testable(candidates, found.predictor.data)[0], level)
 
 
@@ -96,7 +96,7 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     lever = float(after.scores.levers[k, place]) * after.fit.predictor.layout.free[k].derivative(after.fit[INLET].value)
     drag = 0.2
     model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
-    with_drag = vt.fit(model, after.fit.pairs, fixed=[DRAG], profile=False)
+    with_drag = vt.fit(model, after.fit.pairs, fixed=[DRAG])
     fell = after.fit[INLET].value - with_drag[INLET].value
     # First order in C_D; spreads and noise are estimated anew in the refit.
     assert fell == pytest.approx(lever * drag, rel=0.1)
@@ -131,7 +131,7 @@ B = "eversion_damping.B"
 
 
 def fitted(pairs: Pairs):
-    return vt.fit(vt.base_model(), pairs, profile=False)
+    return vt.fit(vt.base_model(), pairs)
 
 
 def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials=()) -> Pairs:
@@ -192,7 +192,7 @@ HIDDEN = {"pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}), "latch_re
 @pytest.mark.parametrize("name", HIDDEN)
 def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
     values, start = HIDDEN[name]
-    base = vt.fit(vt.base_model(), grown(values, seed=31), profile=False)
+    base = vt.fit(vt.base_model(), grown(values, seed=31))
     found = vt.refit(base, base.model + getattr(vt.effects, name), start=start)
     assert found.log_likelihood > base.log_likelihood + 10
     assert found.chi2_per_dof < 1.3
@@ -233,7 +233,7 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
 def test_a_fit_is_the_same_once_its_curves_are_made_again():
     """Of trials whose tail rubs. Of many trials a search lets go of curves."""
     model, pairs = vt.base_model(), grown({"tail_friction.mu_w": 1.0}, seed=7270)
-    fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]), profile=False)
+    fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]))
     light = likelihood_ratio.without_curves(fit)
     assert not light.trials
     of_light, of_fit = (relative_residuals(one.predictor, one.solution) for one in (light, fit))
@@ -261,7 +261,7 @@ def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -
 
 @pytest.mark.slow
 def test_a_slack_tail_is_found_where_the_model_has_it_push_or_has_bent_its_trials_until_none_pushes():
-    found = vt.fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
+    found = vt.fit(vt.base_model(), grown_with_tail(60.0, "free"))
     slack = slack_fit(found, print)
     assert slack.names == ("tail_slack",)
     assert slack.sigma > 5
@@ -273,7 +273,7 @@ def test_a_slack_tail_is_found_where_the_model_has_it_push_or_has_bent_its_trial
 
 
 def test_a_bare_vine_on_the_level_pulls_its_tail():
-    assert slack_fit(vt.fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2), profile=False), print) is None
+    assert slack_fit(vt.fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2)), print) is None
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_a_model_that_misses_one_trial_by_far_is_not_adequate():
     pairs = pairs_of(campaigns.grown(trials, 3, values=damping_values(trials)))
     trial, track = pairs[0]
     pairs[0] = (trial, replace(track, time_s=1e3 * track.time_s))
-    diagnosis = vt.diagnose(vt.fit(vt.base_model(), pairs, profile=False), advice=False)
+    diagnosis = vt.diagnose(vt.fit(vt.base_model(), pairs), advice=False)
     assert diagnosis.verdict != "adequate"
     assert [note.facts["names"] for note in diagnosis.notes if note.code == "far_off"] == [[trial.name]]
 

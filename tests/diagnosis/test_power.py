@@ -55,7 +55,7 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     design = planned(2, noise_m=1e-3)
     promised = planned_tests(*design)[0].fit
     filmed = [
-        vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0), profile=False)
+        vt.fit(vt.base_model(), pairs, spreads=design[3], noise=(1e-3, 0.0))
         for pairs in (linear_power.filmed_again(promised, np.random.default_rng(seed)) for seed in range(12))
     ]
     sigmas = np.median([[number.sigma for number in fit.numbers] for fit in filmed], axis=0)
@@ -189,7 +189,7 @@ def grown(trials, seed: int, off: float = 1.0, size: str = "air_drag.C_D", value
 
 
 def fits_of(pairs: Pairs, *effects: str):
-    base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
+    base = vt.fit(vt.base_model(), pairs, host=HOST)
     return [vt.refit(base, base.model + getattr(vt.effects, name)) for name in effects]
 
 
@@ -209,7 +209,7 @@ def as_trials(found: advice.NextExperiment, like: Trial) -> list[Trial]:
 
 def shown(fits, pairs: Pairs) -> float:
     """By how many σ all trials favour the first hypothesis over the second, in excess of those so far."""
-    base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
+    base = vt.fit(vt.base_model(), pairs, host=HOST)
     likelihood = []
     for fit in fits:
         (effect,) = set(fit.model.names) - set(BASE_EFFECTS)

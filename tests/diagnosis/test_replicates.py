@@ -143,7 +143,7 @@ def test_a_row_that_contradicts_the_others_is_named_and_left_out(campaign):
 
 
 def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
-    there = initial_fit(vt.base_model(), campaign, [vt.effects.tail_friction], profile=False)
+    there = initial_fit(vt.base_model(), campaign, [vt.effects.tail_friction])
     monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", lambda *_, **__: pytest.fail("it is made again"))
     result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False, fitted=there)
     assert result.fits[0].numbers == there.numbers

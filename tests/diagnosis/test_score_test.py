@@ -75,7 +75,7 @@ def test_candidates_are_false_alarms_as_seldom_as_they_say(seed, trials, scatter
 def test_a_size_at_its_bound_takes_nothing_from_an_effect():
     """Drag is 0 in these tracks, where a fit with it is a fit without it."""
     pairs, candidate = small_campaign(seed=8, replicates=1)[0], catalogue()["leak"]
-    fits = [vt.fit(model, pairs, profile=False) for model in (vt.base_model(), vt.base_model() + "air_drag")]
+    fits = [vt.fit(model, pairs) for model in (vt.base_model(), vt.base_model() + "air_drag")]
     assert [number.bound for number in fits[1].numbers if number.key == "air_drag.C_D"] == [0]
     without, at_bound = (misfit_tests.misfit_tests(fit, [candidate], FIRST).scores for fit in fits)
     np.testing.assert_allclose(at_bound.plain_sigma, without.plain_sigma, rtol=3e-3)

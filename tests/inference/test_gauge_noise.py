@@ -300,7 +300,7 @@ def laboratory(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fit(laboratory):
-    return vt.fit(vt.base_model(), laboratory[0], profile=False)
+    return vt.fit(vt.base_model(), laboratory[0])
 
 
 def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, laboratory):
@@ -342,7 +342,7 @@ def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_th
     for (trial, track), true in zip(pairs, truth, strict=True):
         gauge_Pa = trial.pressure_Pa * true["pressure"] + gauge_noise_Pa * draw.standard_normal(track.time_s.size)
         seen.append((trial, as_track(track.time_s, track.lead_position_m, gauge_Pa)))
-    traced = vt.fit(vt.base_model(), seen, profile=False)
+    traced = vt.fit(vt.base_model(), seen)
     assert traced.chi2_per_dof < 1.15
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):

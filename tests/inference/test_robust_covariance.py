@@ -50,7 +50,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
     """Root mean square error of n and both B in standard errors, by the model of the noise and by what a fit says."""
     by_noise, stated = [], []
     for seed in seeds:
-        found = vt.fit(vt.base_model(), make(seed), profile=False)
+        found = vt.fit(vt.base_model(), make(seed))
         narrow = np.sqrt(np.diag(errors.precision(found.solution).covariance))
         for k, number in enumerate(found.numbers):
             if number.key == "yield_pressure.P_y":
@@ -71,7 +71,7 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies():
 
     What trials err by together, which here is more, is left aside.
     """
-    found = vt.fit(vt.base_model(), unlike(20620), profile=False)
+    found = vt.fit(vt.base_model(), unlike(20620))
     covariance, robust, _ = errors.robust_variances(found.predictor, found.solution)
     plain = np.diag(covariance)
     assert np.max(robust / plain) > 1.5
@@ -138,7 +138,7 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     """The same tracks, once with their days told: eight days of two trials, whose bends are those of the day."""
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
-    found = vt.fit(vt.base_model(), bent(pairs, bends_m), profile=False)
+    found = vt.fit(vt.base_model(), bent(pairs, bends_m))
     alone = errors.robust_variances(found.predictor, found.solution)[1]
     told = enumerate(found.predictor.data)
     found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
@@ -166,7 +166,7 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     vines = [replace(vine_trial(f"t{k}", 20), vine="v", condition="c") for k in range(trials)]
     pairs = [(trial, filmed(trial, draw, damping=f)[0]) for trial, f in zip(vines, factors.tolist(), strict=True)]
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
-    found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
+    found = vt.fit(model, pairs, fixed=["n", "P_y"])
     B = found["B"]
     assert errors.robust_variances(found.predictor, found.solution)[2][0] == pytest.approx(trials - 1, rel=0.05)
     standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
@@ -176,7 +176,7 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
 
 
 def last_of(drops: Pairs) -> fit_result.TrialFit:
-    return vt.predict(vt.fit(FALL, drops[:-1], profile=False), drops[-1:])[0]
+    return vt.predict(vt.fit(FALL, drops[:-1]), drops[-1:])[0]
 
 
 @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_the_band_of_drops_that_agree_is_their_noise():
 def test_a_trial_that_depends_on_what_the_fit_does_not_determine_has_no_band():
     """Friction of a payload, fitted to bare vines: a band would take what it stays at for known exactly."""
     pairs, draw = small_campaign(4)[0], np.random.default_rng(4)
-    fit = vt.fit(vt.base_model() + "payload_friction", pairs, profile=False)
+    fit = vt.fit(vt.base_model() + "payload_friction", pairs)
     loaded = replace(pairs[0][0], name="loaded", payload_kg=0.06)
     bare, heavy = vt.predict(fit, [pairs[0], (loaded, filmed(loaded, draw)[0])])
     assert np.isfinite(bare.band_m).all()
@@ -202,7 +202,7 @@ def test_a_trial_that_depends_on_what_the_fit_does_not_determine_has_no_band():
 
 def fitted(seed: int = 1, replicates: int = 3, **changes: float) -> fit_result.Fit:
     pairs, _ = small_campaign(seed, damping=5e-3, pressure=2e-3, replicates=replicates)
-    return vt.fit(vt.base_model(), [(replace(trial, **changes), track) for trial, track in pairs], profile=False)
+    return vt.fit(vt.base_model(), [(replace(trial, **changes), track) for trial, track in pairs])
 
 
 def test_the_lens_adds_to_the_error_what_is_said_to_be_its_part():
@@ -230,7 +230,7 @@ def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
         stated = {vine: 3e3 + 300.0 * rng.standard_normal() for vine in dict.fromkeys(trial.vine for trial, _ in pairs)}
         told = {vine: {"yield_pressure_Pa": P_y, "yield_pressure_sigma_Pa": 300.0} for vine, P_y in stated.items()}
         misread = [(replace(trial, **told[trial.vine]), track) for trial, track in pairs]
-        fit = vt.fit(vt.base_model(), misread, profile=False)
+        fit = vt.fit(vt.base_model(), misread)
         z += [test["z"] for test in against_the_sheet(fit)]
     assert math.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.3)
 

@@ -240,7 +240,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
     pairs = [(one.stated, one.track) for one in grow(trials, nature)]
     settings = RunSettings.model_validate({"damping": {"resamples": 300}})
     motions = look_at_motions(pairs, settings)
-    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
+    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs)
     before, after = (redo_damping(model, motions, settings) for model in (vt.base_model(), found.model))
 
     def worst_B(law: Mapping) -> float:

@@ -270,7 +270,7 @@ def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
     """Each release is rounded off by half a millimetre and more, ten times the noise."""
     shot = campaign("smoothed", 20616, (8, 8), weighed=False)
     write_experiment(shot, tmp_path / "laboratory")
-    fit = vt.fit(vt.base_model(), tmp_path / "laboratory", profile=False)
+    fit = vt.fit(vt.base_model(), tmp_path / "laboratory")
     assert fit.chi2_per_dof < 1.2
     (n,) = (number for number in fit.numbers if number.key == "eversion_damping.n")
     truth = shot.truth["truths"]["eversion_damping.n"]  # type: ignore[index]

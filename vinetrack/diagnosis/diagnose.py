@@ -90,7 +90,7 @@ def diagnose(
     dropped = lost_frames(pairs)
     report("fitting the model")
     if fitted is None or dropped:
-        fit = initial_fit(model, pairs, effects, profile=False)
+        fit = initial_fit(model, pairs, effects)
     else:
         fit = with_host(fitted, host_for(model, effects))
     unfit: dict[str, list[str]] = {}
@@ -102,7 +102,7 @@ def diagnose(
     if odd := odd_trials(fit.predictor.data):
         told.append(remark("odd_trials", odd=odd, count=len(fit.trials)))
         others = [pair for pair in pairs if pair[0].name not in {trial.name for trial in odd}]
-        fit = initial_fit(model, others, effects, profile=False)
+        fit = initial_fit(model, others, effects)
     result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
     result = with_lost_frames(replace(result, odd_trials=tuple(trial.name for trial in odd)), dropped)
     told.append(longer_than_stated(pairs))

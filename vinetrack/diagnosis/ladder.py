@@ -69,11 +69,9 @@ def with_host(fit: Fit, host: Model | None) -> Fit:
     return replace(fit, predictor=predictor.with_steps_of(fit.predictor))
 
 
-def initial_fit(
-    model: Model, pairs: Pairs, candidates: Iterable[Effect], *, profile: bool = True, free: Iterable[str] = ()
-) -> Fit:
+def initial_fit(model: Model, pairs: Pairs, candidates: Iterable[Effect], *, free: Iterable[str] = ()) -> Fit:
     """Fit the model in use, as the diagnosis does."""
-    return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile)
+    return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)))
 
 
 # ------------------------------------------------------------------------------

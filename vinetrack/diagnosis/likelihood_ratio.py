@@ -291,5 +291,5 @@ def with_curves(fit: Fit) -> Fit:
     columns = predictor.linearise(state.theta, state.trial_effects)
     # Cross products stay those of the fit, whose columns were computed with other steps.
     solution = replace(fit.solution, columns=tuple(columns))
-    trials = assemble(former, solution, fit.left_out, fit.options, profile=False).trials
+    trials = assemble(former, solution, fit.left_out, fit.options).trials
     return replace(fit, trials=trials, solution=solution)

@@ -409,7 +409,7 @@ def planned_tests(
         position_m = moved.observed_position_m[: time_s.size] + ar1_noise(time_s.size, rest_m, 0.0, draw)
         pairs.append((trial, plain_track(time_s - time_s[0], position_m)))
     to_fit = make_model(model.names, model.user_effects)
-    fitted = fit(to_fit, pairs, spreads=spreads, noise=noise, host=host, profile=False)
+    fitted = fit(to_fit, pairs, spreads=spreads, noise=noise, host=host)
     return fitted_tests(fitted, candidates)
 
 

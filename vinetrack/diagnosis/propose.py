@@ -78,7 +78,7 @@ def add(
     report("fitting the model as it is")
     candidates = candidates_of(model, experiment.settings.candidates, user_effects)
     candidates += tuple(effect for effect in effects if effect not in candidates)
-    before = after = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
+    before = after = initial_fit(model, pairs_of(experiment, tracks)[0], candidates)
     for effect in effects:
         after = fit_with(after, effect, report)
     report("errors before and after")
@@ -233,7 +233,7 @@ class Proposal:
 def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Proposal:
     """Find laws of force that explain the misfit of a model, and fit each in the equation of motion."""
     report("fitting the model")
-    before = initial_fit(model, pairs, candidates_of(model, None, {}), profile=False)
+    before = initial_fit(model, pairs, candidates_of(model, None, {}))
     report("estimating the missing force")
     force = missing_force(before)
     detected = force.detected

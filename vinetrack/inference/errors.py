@@ -1,4 +1,4 @@
-"""Errors of fitted parameters: precision with systematic errors, profile intervals, few trials, scatter of trials.
+"""Errors of fitted parameters: precision with systematic errors, few trials, scatter of trials.
 
 The systematic errors (`vinetrack.inference.systematics`) are parameters of the linearised fit, each with its prior. Its
 likelihood compares hypotheses without crediting any of them with what such an error could explain.
@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
@@ -31,7 +30,6 @@ from vinetrack.inference.optimiser import (
     CONVERGED_VARIANCES,
     FixedTerms,
     Solution,
-    solve,
     update_variances,
     variance_change,
 )
@@ -39,16 +37,12 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import systematics_of
 
 # ------------------------------------------------------------------------------
-# Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
+# Uncertainty of the parameters of a fit: covariance and degrees of freedom.
 #
 # The covariance is the inverse information of the linearised mixed model, widened by the scatter of trials, with its
-# degrees of freedom. Near a bound, where a linear interval is invalid, the interval is that of the profile likelihood:
-# the values that a constrained fit does not reject.
-
+# degrees of freedom. A 95 % interval ends at the bounds of its parameter: near one it holds the truth more often.
 
 LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence on the trajectories (chosen)
-
-NEAR_BOUND_SIGMAS = 3.5  # Standard errors from a bound within which the interval is a profile interval
 
 
 @dataclass(frozen=True)
@@ -99,72 +93,6 @@ def precision(solution: Solution) -> Precision:
 def student(dof: Floats) -> Floats:
     """Half width of a 95 % interval in standard errors."""
     return np.asarray(stdtrit(np.minimum(dof, 1e6), 0.975))
-
-
-def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
-    """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors. Shapes: sigma (n_free,) → (n_free,)."""
-    problem, theta = solution.problem, solution.state.theta
-    room = np.minimum(theta - problem.lower, problem.upper - theta)
-    return np.isfinite(sigma) & (room < NEAR_BOUND_SIGMAS * sigma)
-
-
-def profile_interval(
-    predictor: Predictor, solution: Solution, place: int, sigma: float, reach: float
-) -> tuple[float, float]:
-    """Profile-likelihood interval of one parameter: constrained fits whose −2 ln L lies within `reach`² of the best.
-    Between-trial standard deviations and noise stay those of the best fit, so that for a linear model this is the
-    interval ± `reach` · `sigma`. A side that meets a bound first ends there. Returns low, high, scaled.
-    """
-    problem, state = solution.problem, solution.state
-    held = FixedTerms(state.spread, (state.rho, state.variance))
-    best = solution.deviance(restricted=False)
-    ends = []
-    for side, bound in ((-1, problem.lower[place]), (1, problem.upper[place])):
-        value, evaluated = float(state.theta[place]), [(0.0, 0.0)]
-        distance = reach * sigma
-        for _ in range(6):
-            distance = min(distance, abs(bound - value))
-            if distance <= 1e-12:
-                break
-            rise = _deviance_increase(predictor, solution, held, place, value + side * distance, best)
-            evaluated.append((distance, math.copysign(math.sqrt(abs(rise)), rise)))
-            if abs(evaluated[-1][1] - reach) < 0.03 * reach or (
-                distance >= abs(bound - value) and evaluated[-1][1] < reach
-            ):
-                break
-            distance = _next_distance(evaluated, reach)
-        ends.append(value + side * min(distance, abs(bound - value)))
-    return ends[0], ends[1]
-
-
-def _deviance_increase(
-    predictor: Predictor, solution: Solution, held: FixedTerms, place: int, value: float, best: float
-) -> float:
-    """Increase of −2 ln L if one parameter is fixed at `value` and all others are fitted again."""
-    free = solution.problem.free.copy()
-    free[place] = False
-    theta = solution.state.theta.copy()
-    step = value - theta[place]
-    covariance = precision(solution).covariance
-    if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
-        direction = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
-        theta = np.clip(theta + direction * step, solution.problem.lower, solution.problem.upper)
-    theta[place] = value
-    problem = replace(solution.problem, free=free)
-    try:
-        constrained = solve(predictor, problem, replace(solution.state, theta=theta), held, most_iterations=8)
-    except SimulationError:
-        return 1e6
-    return constrained.deviance(restricted=False) - best
-
-
-def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
-    """Distance at which the root of the increase reaches its target, by a chord through the two nearest points."""
-    below = max((point for point in evaluated if point[1] <= reach), key=lambda point: point[0])
-    above = min((point for point in evaluated if point[1] > reach), key=lambda point: point[0], default=None)
-    if above is None:
-        return below[0] * float(np.clip(reach / max(below[1], 0.2), 1.2, 3.0))
-    return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])
 
 
 @dataclass(frozen=True)

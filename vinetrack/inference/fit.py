@@ -303,7 +303,7 @@ def fit_subset(
         solution = solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms})
 
 
 # ------------------------------------------------------------------------------
@@ -415,7 +415,6 @@ def fit(
     start: Mapping[str, Value] | None = None,
     spreads: tuple[float, float] | None = None,
     noise: tuple[float, float] | None = None,
-    profile: bool = True,
     host: Model | None = None,
     watch: Watch | None = None,
 ) -> Fit:
@@ -436,7 +435,7 @@ def fit(
     predictor = Predictor(layout, data, host)
     solution = solve_from_scratch(predictor, fixed_terms, watch)
     _refuse_a_standstill(predictor, solution)
-    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms}, profile=profile)
+    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms})
     return replace(fitted, pairs=tuple(pairs))
 
 
@@ -473,7 +472,6 @@ def refit(
     start: Mapping[str, Value] | None = None,
     hold_spreads: bool = False,
     hold_noise: bool = False,
-    profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     afresh: bool = False,
     once: bool = False,
@@ -496,8 +494,6 @@ def refit(
         Starting values of parameters, mainly of a new effect: a time constant that starts at zero stays there.
     hold_spreads, hold_noise : bool
         Keep the between-trial standard deviations, or the noise, of the previous fit instead of estimating them again.
-    profile : bool
-        Whether intervals near a bound are profile-likelihood intervals.
     most_iterations : int
         Maximum number of steps; a model that only has to be ruled out need not converge.
     afresh : bool
@@ -519,7 +515,7 @@ def refit(
     Examples
     --------
     >>> import vinetrack as vt
-    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
     >>> later = vt.refit(fit, fit.model + "reservoir_depletion")
     >>> later.log_likelihood > fit.log_likelihood
     True
@@ -568,7 +564,6 @@ def refit(
         solution,
         before.left_out,
         {**options_used, "shared": shared_used, "held": fixed_terms},
-        profile=profile,
     )
     return replace(fitted, pairs=before.pairs)
 
@@ -603,7 +598,7 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     --------
     >>> import vinetrack as vt
     >>> pairs = vt.tracks_from_frame(vt.example_tracks())
-    >>> fit = vt.fit(vt.base_model(), pairs[:6], profile=False)
+    >>> fit = vt.fit(vt.base_model(), pairs[:6])
     >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
     ['P48_1', 'P48_2']
     """

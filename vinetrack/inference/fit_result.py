@@ -326,8 +326,8 @@ def or_open(end: float) -> BeforeValidator:
 @dataclass(frozen=True)
 class Number(JsonRecord):
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
-    number applies to all. `method` tells how the interval was found: `linear`, `profile` near a bound, `none` if the
-    data do not determine it. `shared` is the part of the standard error from what all trials share, by its source.
+    number applies to all. `method` is `linear`, or `none` if the data do not determine it. `shared` is the part of the
+    standard error from what all trials share, by its source.
     """
 
     key: Annotated[str, Field(alias="parameter")]

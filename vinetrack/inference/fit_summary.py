@@ -57,7 +57,7 @@ def film_influence(fit: Fit) -> Floats:
     Examples
     --------
     >>> import vinetrack as vt
-    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
     >>> vt.film_influence(fit).shape
     (3,)
     """

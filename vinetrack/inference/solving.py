@@ -18,9 +18,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.errors import (
     Precision,
     WithSystematics,
-    near_bound,
     precision,
-    profile_interval,
     student,
     widened_covariance,
     with_systematics,
@@ -250,8 +248,6 @@ def assemble(
     solution: Solution,
     left_out: Mapping[str, str],
     options: Mapping[str, Any],
-    *,
-    profile: bool,
 ) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout = predictor.layout
@@ -262,7 +258,7 @@ def assemble(
     trials = _with_errors_removed(trials, with_errors)
     precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources)
     precision_of_fit = precision_of_fit.first(len(layout.free))
-    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
+    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
     variance_state = with_errors.solution.state
@@ -321,27 +317,17 @@ def _numbers(
     solution: Solution,
     theta: Floats,
     precision_of_fit: Precision,
-    *,
-    profile: bool,
 ) -> tuple[Number, ...]:
     """The free parameters, the first entries of `theta`, with their errors and intervals."""
     layout, problem = predictor.layout, solution.problem
     sigma = np.sqrt(np.diag(precision_of_fit.covariance))
     dof = precision_of_fit.degrees
     reach = student(dof)
-    doubtful = near_bound(solution, sigma)
     numbers = []
     for k, number in enumerate(layout.free):
         low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
         if not math.isfinite(sigma[k]):
             low, high, method = problem.lower[k], problem.upper[k], "none"
-        elif doubtful[k] and profile:
-            # The likelihood accounts for the noise alone, without the lens or pooling: the interval is widened by the
-            # ratio of the errors, and lies about the value that is stated.
-            narrow = math.sqrt(precision(solution).covariance[k, k])
-            ends = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
-            low, high = (end + theta[k] - solution.state.theta[k] for end in ends)
-            method = "profile"
         low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
         at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
         slope = number.derivative(number.from_scaled(float(theta[k])))

@@ -319,7 +319,7 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     Examples
     --------
     >>> import vinetrack as vt
-    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
     >>> type(fit.plot("model_residuals")).__name__
     'Figure'
     """
@@ -416,7 +416,7 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     Examples
     --------
     >>> import vinetrack as vt
-    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
     >>> fit
     Fit(pressure_drive + gravity + eversion_damping + yield_pressure; 8 trials)
     >>> fit.table()["unit"].tolist()
@@ -529,7 +529,7 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     Examples
     --------
     >>> import vinetrack as vt
-    >>> comparison = vt.compare(vt.fit(vt.base_model(), vt.example_tracks(), profile=False))
+    >>> comparison = vt.compare(vt.fit(vt.base_model(), vt.example_tracks()))
     >>> list(comparison.table.columns)[:3]
     ['model', 'condition', 'rms_position_m']
     """

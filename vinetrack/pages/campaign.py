@@ -331,7 +331,7 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     model = replace(sized_model(campaign, choice), values={})
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
-    fitted = fit(model, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
+    fitted = fit(model, campaign.pairs, free=free, host=campaign.host, watch=watch)
     return _evaluated(campaign, choice, fitted)
 
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR, confirmed, remark
-from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
@@ -28,7 +27,6 @@ from vinetrack.diagnosis.ladder import (
     in_sample,
     initial_fit,
     moved,
-    with_host,
 )
 from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import propose
@@ -43,7 +41,6 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
-from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 from vinetrack.kinematics.velocity import estimate_kinematics
 from vinetrack.narrative.diagnosis_text import proposal_lines
@@ -88,7 +85,12 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
     pairs = measured_trials(experiment, results)
     initial: Fit | None = None
     try:
-        initial, fit = _fits(experiment, pairs)
+        model = model_of(experiment)
+        candidates = candidates_of(model, experiment.settings.candidates, experiment.user_effects)
+        # The g of a body that falls by gravity alone tests the whole chain; a diagnosis holds it.
+        free = ("gravity.g",) if model.names == ("gravity",) else ()
+        fit = initial_fit(model, pairs, candidates, free=free)
+        initial = None if free else fit
         how = job.settings.velocity.model_dump()
         kinematics = {t.name: estimate_kinematics(track, travel_ratio=t.travel_ratio, **how) for t, track in pairs}
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
@@ -125,20 +127,6 @@ def _emptied(folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
-
-
-def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit | None, Fit]:
-    """Fit the model in use once: the fit as a diagnosis starts from it, and with intervals near bounds. A body that
-    falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
-    """
-    model, settings = model_of(experiment), experiment.settings
-    candidates = candidates_of(model, settings.candidates, experiment.user_effects)
-    if model.names == ("gravity",):
-        return None, initial_fit(model, pairs, candidates, free=("gravity.g",))
-    initial = initial_fit(model, pairs, candidates, profile=False)
-    own = with_host(initial, initial.predictor.host)  # a predictor of its own: what uses one adapts its steps
-    fit = assemble(own.predictor, own.solution, own.left_out, own.options, profile=True)
-    return initial, replace(fit, pairs=initial.pairs)
 
 
 def _reason(error: Exception) -> str:

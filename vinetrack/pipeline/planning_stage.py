@@ -468,14 +468,14 @@ def _measured_campaign(
 ) -> Campaign:  # fmt: skip
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
-    fitted = fit(model, pairs, host=host, profile=False)
+    fitted = fit(model, pairs, host=host)
     noise, spreads, inputs = request.scatter(
         (fitted.noise_m, fitted.noise_correlation), "fit", fitted.state.spread, "fit"
     )
     of_points = noise if inputs[0].origin == "stated" else None
     of_trials = spreads if inputs[1].origin == "stated" else None
     if of_points or of_trials:
-        fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False)
+        fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host)
     else:
         inputs = []
     return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits or Limits()
