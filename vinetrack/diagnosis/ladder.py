@@ -454,7 +454,7 @@ LADDER_COLUMNS = (
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
-MAX_FOLDS = 48  # Maximum number of folds of the cross-validation (chosen)
+MAX_FOLDS = 10  # Maximum number of folds of the cross-validation (chosen)
 
 # Iterations of a fit without one condition, which starts near its minimum and converges in two or three (chosen)
 MOST_ITERATIONS = 6
