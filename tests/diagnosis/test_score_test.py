@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.diagnosis import likelihood_ratio as ratios
-from vinetrack.diagnosis import misfit_tests
+from vinetrack.diagnosis import misfit_tests, selection
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Scores
 from vinetrack.effects import catalogue
 from vinetrack.inference import fit_result, marginal_likelihood
@@ -289,6 +289,16 @@ def test_an_implausible_size_is_believed_where_no_other_is_plausible():
     assert [one.label for one in ratios.answer_set([best, other])[0]] == ["air_drag", "inlet_loss"]
     assert ratios.answer_set([far, other]) == ([other], {"air_drag": "far"})
     assert ratios.answer_set([far, replace(other, credible=False, reason="none")]) == ([far], {"inlet_loss": "none"})
+
+
+@pytest.mark.parametrize(("beyond_belief", "named"), [(-99.0, []), (-101.0, ["air_drag"])])
+def test_an_implausible_size_is_not_believed_where_one_beyond_belief_fits_better(beyond_belief, named):
+    """A gas of 2.5 times its density was named for a drag that was ten times the largest known."""
+    far = replace(hypothesis("air_drag", -100.0), plausible=False, reason="far")
+    further = replace(hypothesis("inlet_loss", beyond_belief), plausible=False, credible=False, reason="further")
+    tests = SimpleNamespace(rejects_model=False, fit=far.fit)
+    adequate, _, _ = selection.adequate_hypotheses([far, further], SimpleNamespace(tests_after=lambda _: tests))
+    assert [one.label for one in adequate] == named
 
 
 def test_any_phase_of_a_swing_is_plausible():

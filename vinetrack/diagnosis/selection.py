@@ -245,6 +245,7 @@ def adequate_hypotheses(
     """
     _, rejected = answer_set(hypotheses)
     best, by_likelihood = best_of(hypotheses), sorted(hypotheses, key=lambda ratio: -ratio.fit.log_likelihood)
+    beyond_belief = max((ratio.fit.log_likelihood for ratio in hypotheses if not ratio.credible), default=-math.inf)
     adequate: list[LikelihoodRatio] = []
     after: MisfitTests | None = None
     for hypothesis in by_likelihood:
@@ -252,7 +253,8 @@ def adequate_hypotheses(
             continue
         if hypothesis not in answer_set([*adequate, hypothesis])[0]:
             continue
-        if not hypothesis.credible:
+        # A size outside its plausible range is believed where nothing beyond belief fits better.
+        if not hypothesis.credible or (not hypothesis.plausible and hypothesis.fit.log_likelihood < beyond_belief):
             rejected[hypothesis.label] = hypothesis.reason
             continue
         tests = search.tests_after(hypothesis.fit)
