@@ -301,6 +301,19 @@ def test_an_implausible_size_is_not_believed_where_one_beyond_belief_fits_better
     assert [one.label for one in adequate] == named
 
 
+def test_a_set_is_worth_what_it_has_more_than_the_best_one_within_it(monkeypatch):
+    """A refill so slow that it is a depletion fitted better than the depletion; depletion and drag were held against
+    it as two sizes more, and a drag of 5.2 σ was within chance.
+    """
+    search = selection.Search(SimpleNamespace(fit=known_fit(-200.0)), str)
+    monkeypatch.setattr(search, "tests_after", lambda _: SimpleNamespace(family=dict.fromkeys(catalogue(), 4.9)))
+    for gained, *names in ((100.2, "supply_refill"), (100.0, "reservoir_depletion"), (60.0, "air_drag")):
+        search.fitted[frozenset(names)] = hypothesis(names[0], -200.0 + gained)
+    for gained, better in ((112.0, False), (113.7, True)):
+        both = tuple(catalogue()[name] for name in ("reservoir_depletion", "air_drag"))
+        assert search.is_better(replace(hypothesis("air_drag", -200.0 + gained), effects=both)) == better
+
+
 def test_any_phase_of_a_swing_is_plausible():
     """A phase of −3.67 rad is one of 2.61."""
     of = {parameter.name: parameter for parameter in catalogue()["supply_pulsation"].parameters}

@@ -186,13 +186,15 @@ class Search:
         return Remark()
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
-        """Whether a set is better than a smaller one by at least the threshold of its additional effect. The smaller
-        set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any nested one
-        that was fitted, so the criterion is then the stricter.
+        """Whether a set is better than a smaller one, by default the best of one effect fewer, by at least the
+        threshold of what it has more than the best one within it. A smaller set that is not within it fits no worse
+        than that one, so the criterion is then the stricter.
         """
-        smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
-        family = self.tests_after(smaller.fit).family
-        added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
+        names, count = set(hypothesis.names), len(hypothesis.effects) - 1
+        smaller = smaller or self.of_size(count)[0]
+        within = best_of([known for known in self.of_size(count) if names.issuperset(known.names)] or [smaller])
+        added = [effect for effect in hypothesis.effects if effect.name not in within.names]
+        family = self.tests_after(within.fit).family
         return _worth(hypothesis, smaller, added) >= max(family[effect.name] for effect in added)
 
     def partial_steps(self) -> tuple[LikelihoodRatio, ...]:
