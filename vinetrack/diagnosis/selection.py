@@ -190,12 +190,16 @@ class Search:
         threshold of what it has more than the best one within it. A smaller set that is not within it fits no worse
         than that one, so the criterion is then the stricter.
         """
-        names, count = set(hypothesis.names), len(hypothesis.effects) - 1
-        smaller = smaller or self.of_size(count)[0]
-        within = best_of([known for known in self.of_size(count) if names.issuperset(known.names)] or [smaller])
+        smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
+        within = self.best_within(hypothesis) or smaller
         added = [effect for effect in hypothesis.effects if effect.name not in within.names]
         family = self.tests_after(within.fit).family
         return _worth(hypothesis, smaller, added) >= max(family[effect.name] for effect in added)
+
+    def best_within(self, hypothesis: LikelihoodRatio) -> LikelihoodRatio | None:
+        """The best set that lacks one effect of this one; None where none was fitted."""
+        smaller = self.of_size(len(hypothesis.effects) - 1)
+        return next((one for one in smaller if set(one.names) < set(hypothesis.names)), None)
 
     def partial_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant;
@@ -454,6 +458,9 @@ def _effect_set_rounds(search: Search) -> list[SelectionStep]:
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
         adequate, of_these, after = adequate_hypotheses(of_this_size, search)
+        if after is not None and (base := search.best_within(adequate[0])):
+            # Those in its place may be likelier than the few that were tried.
+            adequate, of_these, after = adequate_hypotheses(search.extend(base), search)
         rejected |= of_these
         if after is not None:
             if any(map(search.is_better, adequate)):
