@@ -553,9 +553,7 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials left out (`gone`) by the model fitted to the others."""
     data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
-        others = fit_subset(
-            fit, [not out for out in gone], hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
-        )
+        others = fit_subset(fit, [not out for out in gone], most_iterations=MOST_ITERATIONS)
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
     return _predicted(others, data)

@@ -278,32 +278,20 @@ def _correlation(trial_data: FitTrial, rho: float) -> Floats:
 # dropped.
 
 
-def fit_subset(
-    fit: Fit,
-    keep: Sequence[bool],
-    *,
-    hold_spreads: bool = False,
-    hold_noise: bool = False,
-    most_iterations: int = MOST_ITERATIONS,
-) -> Fit:
-    """Fit the same model to the trials of a fit that are kept, starting from its solution."""
+def fit_subset(fit: Fit, keep: Sequence[bool], *, most_iterations: int = MOST_ITERATIONS) -> Fit:
+    """Fit the same model to the trials of a fit that are kept, starting from its solution, with its noise and
+    between-trial standard deviations.
+    """
     rows = np.flatnonzero(keep)
     if not rows.size:
         raise FitError("No trial is left to fit: keep one at least.")
     predictor, problem, (state,) = subset(fit.predictor, fit.solution.problem, rows, fit.state)
-    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
-    if fixed_terms.noise is not None:
-        rho, variance = fixed_terms.noise
-        fixed_terms = replace(fixed_terms, noise=(rho, variance[rows]))
-    fixed_terms = FixedTerms(
-        state.spread if hold_spreads else fixed_terms.spread,
-        (state.rho, state.variance) if hold_noise else fixed_terms.noise,
-    )
+    held = FixedTerms(state.spread, (state.rho, state.variance))
     try:
-        solution = solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations)
+        solution = solve(predictor, problem, state, held, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms})
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": held})
 
 
 # ------------------------------------------------------------------------------
