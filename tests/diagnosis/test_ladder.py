@@ -205,12 +205,12 @@ def test_every_trial_finds_the_b_it_was_grown_with():
     values = per_trial_estimates(found, align_trials(found))
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
-    away = np.log(values.base / true) + values.deviation
-    vines = np.array([trial.vine for trial in values.trials])
+    away = np.array(np.log(values["base"] / true) + values["deviation"])
+    vines = np.array([trial.vine for trial in values["trial"]])
     for vine in set(vines):
         away[vines == vine] -= away[vines == vine].mean()
     assert np.std(away) < 0.005
-    assert np.std(values.deviation) > 0.015
+    assert np.std(values["deviation"]) > 0.015
 
 
 @pytest.mark.slow

@@ -106,16 +106,15 @@ def likelihood_ratio(
     """Compare a refit with the fit without the effects."""
     delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
-    plausible, reason = plausibility(effects, after)
-    compatible_with_none = _compatible_with_none(effects, after)
+    none, reason = _compatible_with_none(effects, after), implausible(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
         fit=after,
         delta_chi2=delta_chi2,
         sigma=in_sigmas(delta_chi2 / ratio**2, sizes_of(effects, after) if sizes is None else sizes),
-        plausible=plausible,
-        reason=compatible_with_none or reason,
-        credible=not compatible_with_none and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
+        plausible=not reason,
+        reason=none or reason,
+        credible=not none and not implausible(effects, after, CREDIBLE_RANGE_FACTOR),
         inflation=ratio**2,
     )
 
@@ -127,10 +126,10 @@ def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> Remark:
     for effect in effects:
         # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
         for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
-            key = f"{effect.name}.{parameter.name}"
-            numbers = [number for number in after.numbers if number.key == key and math.isfinite(number.sigma)]
+            numbers = [number for number in after.numbers if number.key == f"{effect.name}.{parameter.name}"]
+            known = [number for number in numbers if 0 < number.sigma < math.inf]
             # Where each vine has its own size, one that differs from zero is enough.
-            sigmas = [abs(number.value - parameter.zero) / number.sigma for number in numbers if number.sigma > 0]
+            sigmas = [abs(number.value - parameter.zero) / number.sigma for number in known]
             if sigmas and max(sigmas) < MIN_SIZE_SIGMAS:
                 return remark("size_may_be_zero")
     return Remark()
@@ -160,23 +159,20 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
     return max(float(-ndtri_exp(log_p - math.log(2))), 0.0)
 
 
-def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, Remark]:
-    """Whether the fitted sizes are plausible, and if not, why. Returns plausible, reason (blank where they are
-    plausible).
-    """
-    for effect in effects:
-        for parameter in effect.parameters:
-            for number in after.numbers:
-                if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
-                    continue
-                low, high = parameter.plausible or (math.nan, math.nan)
-                # At a bound outside the plausible range the size is implausible whatever its standard error.
-                at_implausible_bound = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
-                if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
-                    unit = "" if parameter.unit == "1" else parameter.unit
-                    facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
-                    return False, Remark("implausible_size", facts | {"pressure_unit": number.pressure_unit})
-    return True, Remark()
+def implausible(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> Remark:
+    """Why the fitted sizes are not plausible; blank where they are."""
+    parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
+    for number in after.numbers:
+        if (parameter := parameters.get(number.key)) is None or not math.isfinite(number.sigma):
+            continue
+        low, high = parameter.plausible or (math.nan, math.nan)
+        # At a bound outside the plausible range the size is implausible whatever its standard error.
+        at_implausible_bound = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
+        if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
+            unit = "" if parameter.unit == "1" else parameter.unit
+            facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
+            return Remark("implausible_size", facts | {"pressure_unit": number.pressure_unit})
+    return Remark()
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:

@@ -16,10 +16,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import (
     AlignedTrials,
     Replicates,
@@ -206,8 +204,9 @@ def drift(fit: Fit, aligned: AlignedTrials | None = None) -> Drift:
 
     tests = list(against_the_sheet(fit))
     if DAMPING in fit.predictor.layout.keys:
-        estimates = per_trial_estimates(fit, aligned or align_trials(fit))
-        tests = [*(test for against in COVARIATES for test in _against(estimates, against)), *tests]
+        of_trials = per_trial_estimates(fit, aligned or align_trials(fit))
+        damping = next(number for number in fit.numbers if number.key == DAMPING)
+        tests = [*(test for against in COVARIATES for test in _against(of_trials, damping, against)), *tests]
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     table = pd.DataFrame(tests, columns=[*DRIFT_COLUMNS, "p", "groups"]).sort_values(
         "p", kind="stable", ignore_index=True
@@ -233,19 +232,16 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
 Row = dict[str, object]
 
 
-def _subject(number: Number, vine: str, against: str) -> Row:
-    """What rows of both tables are about: the parameter, its vine, and the condition."""
-    return {"parameter": number.key, "vine": vine, "symbol": number.symbol, "unit": number.unit, "against": against}
-
-
 def _tested(
-    subject: Row,
+    number: Number,
+    vine: str,
+    against: str,
     levels: tuple[float, float],
     change: tuple[float, float],
     p: float,
     dof: float,
     n_trials: int,
-    groups: Sequence[Row] = (),
+    groups: Sequence[tuple[float, ...]] = (),
     **told: Any,
 ) -> Row:
     """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
@@ -253,115 +249,76 @@ def _tested(
     """
     from scipy.stats import norm
 
+    subject = (number.key, vine, number.symbol, number.unit, against)
     numbers = (*levels, *change, float(norm.isf(max(p, 1e-300) / 2)), dof, n_trials)
-    row = subject | dict(zip(DRIFT_COLUMNS[len(subject) :], numbers, strict=False))
-    return row | {"sentence": remark("drifts", row=row, **told), "p": p, "groups": groups}
+    row: Row = dict(zip(DRIFT_COLUMNS, (*subject, *numbers), strict=False))
+    sentence = remark("drifts", row=row, pressure_unit=number.pressure_unit, **told)
+    of_groups = [dict(zip(GROUP_COLUMNS, (*subject, *group), strict=True)) for group in groups]
+    return row | {"sentence": sentence, "p": p, "groups": of_groups}
 
 
 # ------------------------------------------------------------------------------
-# B of each trial, with all other parameters at their common values.
+# B of each trial, with all other parameters at their common values, and tests of whether it changes with a condition: a
+# linear trend.
 
 
-@dataclass(frozen=True)
-class PerTrialEstimates:
-    """B of each trial; arrays of shape (n_trials,). `number` is B as fitted, `vines` are blank where all have one B;
-    `base` is the common value, `deviation` that of the best ln B of the trial from it, NaN where a trial does not
-    depend on it; `variance` is that from a typical scatter of pressure and B, up to a factor.
+def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> pd.DataFrame:
+    """Ln B of each trial that depends on it, by least squares of position with its release free: the trial, its vine
+    (blank where all have one B), the common value (`base`), the `deviation` of the best ln B from that, and its
+    `weight`, the inverse of its variance by a typical scatter of pressure and B, up to a factor.
     """
+    import pandas as pd
 
-    number: Number
-    trials: tuple[Trial, ...]
-    vines: NDArray[np.str_]
-    conditions: NDArray[np.str_]
-    base: Floats
-    deviation: Floats
-    variance: Floats
-
-
-def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> PerTrialEstimates:
-    """Ln B of each trial by least squares of position, with its release free, about the common value."""
-    data = aligned.predictor.data
-    deviation, variance = np.full(len(data), math.nan), np.empty(len(data))
-    for i, columns in enumerate(aligned.columns):
-        others = columns[:, aligned.nuisances(i)]
+    has_own = any(number.vine for number in fit.numbers if number.key == DAMPING)
+    bases, rows = aligned.predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)], list[tuple[object, ...]]()
+    for i, (trial_data, columns, base) in enumerate(zip(aligned.predictor.data, aligned.columns, bases, strict=True)):
+        trial, others = trial_data.trial, columns[:, aligned.nuisances(i)]
         sensitivity = orthogonal_part(columns[:, DAMPING_DEVIATION], others)
-        response = max(float(np.sum(sensitivity**2)), 1e-300)
-        levers = sensitivity @ orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], others) / response
-        variance[i] = np.sum(np.square(TYPICAL_SPREADS * levers)) + data[i].mean_noise_m ** 2 / response + 1e-12
+        response = float(np.sum(sensitivity**2))
         # 1e-12: least response of a trial, relative to its travel, from which it tells its B (derived)
-        if response > 1e-12 * float(np.ptp(data[i].lead_position_m)) ** 2 * len(columns):
-            deviation[i] = sensitivity @ columns[:, -1] / response
-    number, trials = next(each for each in fit.numbers if each.key == DAMPING), tuple(each.trial for each in data)
-    return PerTrialEstimates(
-        number=number,
-        trials=trials,
-        vines=np.array([trial.vine if number.vine else "" for trial in trials]),
-        conditions=np.array([trial.condition for trial in trials]),
-        base=aligned.predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)],
-        deviation=deviation,
-        variance=variance,
-    )
+        if response > 1e-12 * float(np.ptp(trial_data.lead_position_m)) ** 2 * len(columns):
+            levers = sensitivity @ orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], others) / response
+            variance = np.sum(np.square(TYPICAL_SPREADS * levers)) + trial_data.mean_noise_m**2 / response + 1e-12
+            vine = trial.vine if has_own else ""
+            rows.append((trial, vine, trial.condition, base, sensitivity @ columns[:, -1] / response, 1 / variance))
+    return pd.DataFrame(rows, columns=["trial", "vine", "condition", "base", "deviation", "weight"])
 
 
-# ------------------------------------------------------------------------------
-# Tests of whether B of single trials changes with a condition: a linear trend.
-
-
-def _against(estimates: PerTrialEstimates, against: str) -> Iterator[Row]:
-    """Tests of a linear trend against one condition, of each vine alone and of all, about the mean of each vine."""
-    levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
-    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
-    coordinate, weight, vines = levels if linear else np.log(levels), 1 / estimates.variance, estimates.vines
-    known = np.isfinite(estimates.deviation)
-    usable = np.isfinite(levels) & known
-    varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    apart, dof = within_groups(estimates.deviation[known], estimates.conditions[known], weight[known])
-    replicates = float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
-    for vine in [*varying, *([""] if len(varying) > 1 else [])]:
-        chosen = usable & (np.isin(vines, varying) if vine == "" and len(varying) > 1 else vines == vine)
-        w, block, level = weight[chosen], vines[chosen], levels[chosen]
-        x, d = (within_groups(values[chosen], block, w)[0] for values in (coordinate, estimates.deviation))
-        n_vines = np.unique(block).size
-        steady = _steady_change(x, d, w, replicates, n_vines)
-        if steady is None:
-            continue
-        slope, sigma, p, variance, dof = steady
-        subject, groups = _subject(estimates.number, str(vine), against), []
-        for value in np.unique(level).tolist() if n_vines == 1 else ():
-            k = np.flatnonzero(chosen & (levels == value))
-            bases, error = estimates.base[k], math.sqrt(variance / float(np.sum(weight[k])))
-            base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
-            ratio = math.exp(float(np.average(estimates.deviation[k], weights=weight[k])))
-            numbers = (value, base * ratio, base * ratio * error, ratio, ratio * error, k.size)
-            groups.append(subject | dict(zip(GROUP_COLUMNS[len(subject) :], numbers, strict=True)))
-        reach, ends = float(np.ptp(coordinate[chosen])), (float(level.min()), float(level.max()))
-        # Relative change from the smaller value, with its standard error
-        larger = math.exp(abs(slope) * reach)
-        change = larger - 1, larger * sigma * reach
-        pressure = {"pressure_unit": estimates.number.pressure_unit}
-        yield _tested(subject, ends if slope >= 0 else ends[::-1], change, p, dof, d.size, groups, **pressure)
-
-
-def _steady_change(
-    x: Floats, d: Floats, weight: Floats, replicates: tuple[float, int], n_means: int
-) -> tuple[float, float, float, float, int] | None:
-    """Slope of values about `n_means` means, its standard error and p-value (Student's t), and the variance of the
-    values, relative to 1/weight, with its degrees of freedom: that of replicates, or about the slope, and at least
-    this. None where neither has enough degrees of freedom.
+def _against(of_trials: pd.DataFrame, number: Number, against: str) -> Iterator[Row]:
+    """Tests of a linear trend against one condition, of each vine alone and of all, about the mean of each vine
+    (Student's t). The variance is that of replicates, or about the slope where there are too few.
     """
+    import pandas as pd
     from scipy.stats import t as student
 
-    square, (variance, dof) = float(np.sum(weight * x**2)), replicates
-    if dof < FEWEST_DEGREES:
-        dof = d.size - n_means - 1
-    if dof < FEWEST_DEGREES or not square > 0:
-        return None
-    slope = float(np.sum(weight * x * d)) / square
-    if replicates[1] < FEWEST_DEGREES:
-        variance = float(np.sum(weight * (d - x * slope) ** 2)) / dof
-    variance = max(variance, LEAST_SCATTER**2)
-    sigma = math.sqrt(variance / square)
-    return slope, sigma, float(2 * student.sf(abs(slope) / sigma, dof)), variance, dof
+    levels = np.array([float(getattr(trial, against)) for trial in of_trials["trial"]])
+    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
+    known = of_trials.assign(level=levels, x=levels if linear else np.log(levels))[np.isfinite(levels)]
+    apart, replicates = within_groups(*(of_trials[name].to_numpy() for name in ("deviation", "condition", "weight")))
+    varying = [of_vine for _, of_vine in known.groupby("vine", sort=False) if np.ptp(of_vine["level"]) > 0]
+    for tested in [*varying, *([pd.concat(varying)] if len(varying) > 1 else [])]:
+        vines, w = tested["vine"].to_numpy(), tested["weight"].to_numpy()
+        x, d = (within_groups(tested[name].to_numpy(), vines, w)[0] for name in ("x", "deviation"))
+        square, n_vines = float(np.sum(w * x**2)), len(set(vines))
+        dof = replicates if replicates >= FEWEST_DEGREES else d.size - n_vines - 1
+        if dof < FEWEST_DEGREES or not square > 0:
+            continue
+        slope = float(np.sum(w * x * d)) / square
+        by_slope = np.sum(w * (d - x * slope) ** 2)
+        variance = float(np.sum(of_trials["weight"] * apart**2) if replicates >= FEWEST_DEGREES else by_slope) / dof
+        variance = max(variance, LEAST_SCATTER**2)
+        sigma = math.sqrt(variance / square)
+        groups = []
+        for level, alike in tested.groupby("level") if n_vines == 1 else ():
+            bases, error = alike["base"].to_numpy(), math.sqrt(variance / float(alike["weight"].sum()))
+            base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
+            ratio = math.exp(float(np.average(alike["deviation"], weights=alike["weight"])))
+            groups.append((level, base * ratio, base * ratio * error, ratio, ratio * error, len(alike)))
+        reach, ends = float(np.ptp(tested["x"])), (float(tested["level"].min()), float(tested["level"].max()))
+        # Relative change from the smaller value, with its standard error
+        larger, p = math.exp(abs(slope) * reach), float(2 * student.sf(abs(slope) / sigma, dof))
+        of_test = (ends if slope >= 0 else ends[::-1], (larger - 1, larger * sigma * reach), p, dof, d.size, groups)
+        yield _tested(number, vines[0] if n_vines == 1 else "", against, *of_test)
 
 
 def against_the_sheet(fit: Fit) -> Iterator[Row]:
@@ -378,8 +335,5 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
         pulled_Pa, sigma_Pa = number.value - free.start, math.sqrt(variance)
         p = math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2))
         n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
-        subject, levels = _subject(number, number.vine, "sheet"), (free.start, number.value)
-        change, stated = (pulled_Pa, sigma_Pa), free.prior_sd
-        yield _tested(
-            subject, levels, change, p, math.inf, n_trials, stated_sigma_Pa=stated, pressure_unit=number.pressure_unit
-        )
+        of_test = (free.start, number.value), (pulled_Pa, sigma_Pa), p, math.inf, n_trials
+        yield _tested(number, number.vine, "sheet", *of_test, stated_sigma_Pa=free.prior_sd)
