@@ -6,7 +6,7 @@ diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -110,12 +110,7 @@ def diagnose(
         told.append(remark("far_off", names=list(far_off), percent=100 * max(far_off.values())))
     outliers = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
     result = replace(result, notes=(*result.notes, *filter(None, (*told, outliers))))
-    if ladder:
-        report("errors before and after")
-        result = _or_note(result, "no_ladder", partial(_with_ladder, result))
-    if advice:
-        result = _with_advice(result, limits, report)
-    return result
+    return _with_advice(result, limits, report, ladder, advice)
 
 
 def _far_off(fit: Fit) -> dict[str, float]:
@@ -214,25 +209,25 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         rows.append(row)
     for effect in (effect for name, effect in effects.items() if name not in singles):
         upper_limits, is_detectable = tests.upper_limits(effect)
-        z = tests.best_z(effect.name)
+        z, is_adequate = tests.best_z(effect.name), step.verdict == ADEQUATE
+        # An effect that contains one of the answer set can fit no worse, and need not be fitted.
+        reasons = [remark(CONTAINS, name=answer) for answer in effect.replaces if answer in step.answer_names]
+        status, delta_chi2, sigma = SCREENED, z**2, z
         if effect.name in tests.products.silent:
-            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
-        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family[effect.name]:
-            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
-        else:
-            # An effect that contains one of the answer set can fit no worse, and need not be fitted.
-            contained = [answer for answer in effect.replaces if answer in step.answer_names]
-            row = Candidate(
-                effect.name,
-                effect.kind,
-                SCREENED,
-                z**2,
-                z,
-                in_answer_set=effect.name in step.answer_names,
-                reason=remark(CONTAINS, name=contained[0]) if contained else Remark(),
-                largest=upper_limits if step.verdict == ADEQUATE else {},
-            )
-            rows.append(row)
+            status, delta_chi2, sigma, reasons = NOT_TESTABLE, math.nan, math.nan, [remark("no_response")]
+        elif is_adequate and not is_detectable and z < tests.family[effect.name]:
+            status, reasons = NOT_TESTABLE, [remark("too_weak_here")]
+        row = Candidate(
+            effect.name,
+            effect.kind,
+            status,
+            delta_chi2,
+            sigma,
+            in_answer_set=effect.name in step.answer_names,
+            reason=reasons[0] if reasons else Remark(),
+            largest=upper_limits if is_adequate else {},
+        )
+        rows.append(row)
     rows += [
         Candidate(name, "", NOT_TESTABLE, reason=reason)
         for name, reason in not_testable.items()
@@ -240,14 +235,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -np.nan_to_num(row.delta_chi2)))
-
-
-def _or_note(result: Diagnosis, code: str, found: Callable[[], Diagnosis]) -> Diagnosis:
-    """A diagnosis with more, or with a note why this cannot be computed."""
-    try:
-        return found()
-    except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, remark(code, error=str(error))))
 
 
 def _with_ladder(result: Diagnosis) -> Diagnosis:
@@ -268,26 +255,35 @@ def not_better(added: Sequence[str], errors_m: Sequence[float]) -> list[Remark]:
     ]
 
 
-def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
-    """Add where the first model fails, the force it lacks if no effect explains it, and the next experiment."""
-    if result.verdict != ADEQUATE:
-        report("where it fails")
-        result = _or_note(result, "not_located", partial(_located, result))
-    if UNEXPLAINED in (result.verdict, result.final_verdict):
-        report("computing the missing force")
-        result = _or_note(result, "no_missing_force", partial(_with_missing_force, result))
-    # The trials that would discriminate between the hypotheses that remain
-    last = result.rounds[-1]
+def _with_advice(result: Diagnosis, limits: Limits | None, report: Report, ladder: bool, advice: bool) -> Diagnosis:
+    """Add the ladder; where the first model fails, the force it lacks if no effect explains it, and the next
+    experiment, which would discriminate between the hypotheses that remain. A note says why one cannot be computed.
+    """
+    last, is_unexplained = result.rounds[-1], UNEXPLAINED in (result.verdict, result.final_verdict)
     tied = list(last.fits.values())
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:
         tied.insert(0, last.fit)
-    if last.verdict not in (AMBIGUOUS, ARTEFACT) or len(tied) < 2:
-        return result
+    are_tied = last.verdict in (AMBIGUOUS, ARTEFACT) and len(tied) > 1
+    for is_wanted, what, code, added in (
+        (ladder, "errors before and after", "no_ladder", _with_ladder),
+        (advice and result.verdict != ADEQUATE, "where it fails", "not_located", _located),
+        (advice and is_unexplained, "computing the missing force", "no_missing_force", _with_missing_force),
+        (advice and are_tied, "looking for the next experiment", "no_next_experiment", partial(_next, tied, limits)),
+    ):
+        if is_wanted:
+            report(what)
+            try:
+                result = added(result)
+            except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
+                result = replace(result, notes=(*result.notes, remark(code, error=str(error))))
+    return result
+
+
+def _next(tied: Sequence[Fit], limits: Limits | None, result: Diagnosis) -> Diagnosis:
+    """Add the next experiment."""
     from vinetrack.diagnosis.further_trials import next_experiment
 
-    report("looking for the next experiment")
-    advised = partial(next_experiment, tied, limits)
-    return _or_note(result, "no_next_experiment", lambda: replace(result, next_experiment=advised().to_json()))
+    return replace(result, next_experiment=next_experiment(tied, limits).to_json())
 
 
 def _located(result: Diagnosis) -> Diagnosis:
