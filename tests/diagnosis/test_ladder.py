@@ -325,7 +325,7 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
 @pytest.mark.parametrize("sd", ["B_sd", "pressure_sd_Pa", "gain_sd"])
 def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_deviation(trials, monkeypatch, sd):
     forms = partial(between_trials.of_column, **{sd: 0.03})
-    monkeypatch.setitem(between_trials.BETWEEN, "day", between_trials.BetweenHypothesis("days differ", "again", forms))
+    monkeypatch.setitem(between_trials.BETWEEN, "day", forms)
     known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
     found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9)))
     assert [len(each.terms) for each in found if each.name == "day"] == [1]

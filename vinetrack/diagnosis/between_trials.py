@@ -7,7 +7,7 @@ physics that depends on the condition. Such differences are therefore hypotheses
     ln B_j          = ln B_vine + Σ_g a_g z_gj + u_j
     P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random effects of trials
 
-A hypothesis is an entry of `BETWEEN`: its words, and a function that lists its forms, of which the best counts.
+A hypothesis is an entry of `BETWEEN`, a function that lists its forms, of which the best counts.
 """
 
 from __future__ import annotations
@@ -58,17 +58,6 @@ class Difference:
     def penalised_gain(self) -> float:
         """Fall of −2 ln L less the penalty 2 ln(`n_forms`) for the choice among forms."""
         return self.gain - 2 * math.log(self.n_forms)
-
-
-@dataclass(frozen=True)
-class BetweenHypothesis:
-    """A way in which trials differ, and what to do about it. `forms` lists its forms, given its name, that the trials
-    of a fit, linearised at a solution, can test.
-    """
-
-    summary: str
-    remedy: str
-    forms: Callable[[str, Fit, Solution], Sequence[Difference]]
 
 
 # ------------------------------------------------------------------------------
@@ -210,28 +199,15 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     return bool(np.sum(in_conditions**2) / inner_degrees < 0.5 * np.sum(in_vines**2) / max(outer_degrees, 1))
 
 
+# What lists the forms of a hypothesis, given its name, that the trials of a fit, linearised at a solution, can test
+Forms = Callable[[str, Fit, Solution], Sequence[Difference]]
+
 # Hypotheses that trials differ, by their names in an answer set; standard deviations are chosen
-BETWEEN = {
-    N_BY_VINE: BetweenHypothesis(
-        "the exponent n differs between the vines",
-        "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-        _of_vines,
-    ),
-    ORDER_DRIFT: BetweenHypothesis(
-        "B or the pressure drifts with the order of the trials",
-        "Repeat six trials in random order, number all in the column `order`, and read the gauge at each",
-        _of_order,
-    ),
-    SPECIMEN: BetweenHypothesis(
-        "specimens (tubes of one kind) differ",
-        "Film each specimen at several pressures, and name it in the column `specimen`",
-        partial(_of_specimens, B_sd=0.06, pressure_sd_Pa=300.0),
-    ),
-    "day": BetweenHypothesis(
-        "B or the zero of the gauge differs from day to day",
-        "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
-        partial(of_column, B_sd=0.03, pressure_sd_Pa=300.0, gain_sd=0.03),
-    ),
+BETWEEN: dict[str, Forms] = {
+    N_BY_VINE: _of_vines,
+    ORDER_DRIFT: _of_order,
+    SPECIMEN: partial(_of_specimens, B_sd=0.06, pressure_sd_Pa=300.0),
+    "day": partial(of_column, B_sd=0.03, pressure_sd_Pa=300.0, gain_sd=0.03),
 }
 
 
@@ -244,8 +220,8 @@ def differences(fit: Fit) -> list[Difference]:
     if DAMPING not in fit.predictor.layout.keys:
         return []
     base, best = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution, list[Difference]()
-    for name, hypothesis in BETWEEN.items():
-        forms, estimated = hypothesis.forms(name, fit, base), list[Difference]()
+    for name, forms_of in BETWEEN.items():
+        forms, estimated = forms_of(name, fit, base), list[Difference]()
         for form in forms:
             widened = _widened(fit, base, form)
             gain = _deviance(base, base) - _deviance(widened, base)
@@ -379,8 +355,8 @@ def _effect_of(difference: Difference) -> Effect:
     return Effect(
         name=difference.name,
         kind=BETWEEN_TRIALS,
-        summary=BETWEEN[difference.name].summary,
-        text=BETWEEN[difference.name].summary,
+        summary=difference.name,
+        text=difference.name,
         parameters=tuple(parameters),
         functions={},
         path=Path(difference.name),

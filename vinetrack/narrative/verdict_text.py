@@ -47,13 +47,18 @@ def trials_differ(names: Sequence[str]) -> bool:
     return bool(names) and all(name in BETWEEN for name in names)
 
 
+def difference_text(name: str, remedy: bool = False) -> str:
+    """A difference between trials, or what to do about it."""
+    return sentence(name, {"remedy": remedy})
+
+
 def hypothesis_in_words(result: LikelihoodRatio) -> str:
     """A hypothesis with its sizes: `leak has 1/τ = …`, `specimens (tubes of one kind) differ: ΔlnB (2) = …`."""
     if result.effects[-1].kind != BETWEEN_TRIALS:
         return " has ".join(filter(None, (" with ".join(result.names), sizes_in_words(result.numbers))))
     more = len(result.numbers) - MOST_NAMED
     sizes = f"{sizes_in_words(result.numbers[:MOST_NAMED])}{f' and {more} more' if more > 0 else ''}"
-    return f"{BETWEEN[result.names[-1]].summary}: {sizes}"
+    return f"{difference_text(result.names[-1])}: {sizes}"
 
 
 def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = ()) -> str:
@@ -62,7 +67,7 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
     names = [result.names[-1] for result in answers or step.answer_set if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
-    text = "".join(f" {BETWEEN[name].remedy}." for name in names)
+    text = "".join(f" {difference_text(name, remedy=True)}." for name in names)
     if (ORDER_DRIFT in names or SPECIMEN in names) and not trial_order(trials)[1]:
         text = f" The trials were assumed to be in the order of the rows.{text}"
     return text
@@ -121,7 +126,7 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
     if answers == (DROPPED_FRAMES,):
         return "frames are missing from the recordings"
     if verdict == ARTEFACT and trials_differ(answers):
-        how = " or ".join(BETWEEN[name].summary for name in answers)
+        how = " or ".join(map(difference_text, answers))
         return f"the trials differ, and no physics is missing: {how}"
     return {
         MISSING: f"{joined(names)} {'is' if len(names) == 1 else 'are'} missing",
@@ -321,9 +326,9 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _remedies(names: Sequence[str]) -> str:
     """How each of these is measured, reduced or corrected."""
-    known: dict[str, Any] = {**BETWEEN, **catalogue()}
-    told = [known[name].remedy for name in names if name in known]
-    return " ".join(f"{words.rstrip('.')}." for words in told if words)
+    known = {name: difference_text(name, remedy=True) for name in BETWEEN}
+    known |= {name: effect.remedy for name, effect in catalogue().items()}
+    return " ".join(f"{words.rstrip('.')}." for name in names if (words := known.get(name)))
 
 
 def is_finite(value: Any) -> bool:
