@@ -203,7 +203,11 @@ def test_the_guess_is_exact_for_the_largest_printed_vine_and_its_error_that_of_a
     for size in ((25e-3, 100e-6), (2.5e-3, 50e-6), (100e-3, 400e-6)):
         row = np.array([1.0, math.log(damping_prior(*size))])
         expected = guess.damping_scatter() * math.sqrt(1 + row @ np.linalg.inv(design.T @ design) @ row)
-        assert guess.damping_log_sigma(*size) == pytest.approx(expected)
+        assert guess.damping_log_sigma(size) == pytest.approx(expected)
+    # Carried over from another vine: both scatter about a line whose slope alone is in doubt.
+    step = math.log(damping_prior(25e-3, 100e-6) / damping_prior(*printed(4)))
+    expected = guess.damping_scatter() * math.sqrt(2 + step**2 / np.sum((z - z.mean()) ** 2))
+    assert guess.damping_log_sigma((25e-3, 100e-6), printed(4)) == pytest.approx(expected)
 
 
 PSI = 6.894757

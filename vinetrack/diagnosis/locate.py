@@ -148,10 +148,10 @@ def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
             there = [(of, of.residual_m[at].mean(), of.response_m[at].mean(axis=0)) for of, at in inside if at.any()]
             if count := len(there):
                 mean_m = float(np.mean([residual_m for _, residual_m, _ in there]))
-                variances = [
-                    multiple**2 * response_m @ response_m + of.noise_m2 + of.smooth_m2 for of, _, response_m in there
-                ]
-                sigma_m = math.sqrt(sum(variances)) / count
+                variances = [multiple**2 * response_m @ response_m + of.noise_m2 for of, _, response_m in there]
+                # A lens displaces all trials alike.
+                smooth_m2 = float(np.mean([of.smooth_m2 for of, _, _ in there]))
+                sigma_m = math.sqrt(sum(variances) / count**2 + smooth_m2)
                 rows.append((vine, condition, low, high, (low + high) / 2, mean_m, sigma_m, mean_m / sigma_m, count))
     columns = ("vine", "condition", "from_m", "to_m", "lead_position_m", "mean_residual_m", "sigma_m", "z", "n_trials")
     return pd.DataFrame(rows, columns=list(columns))

@@ -79,15 +79,16 @@ def damping_scatter() -> float:
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
-def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
+def damping_log_sigma(size: tuple[float, float], like: tuple[float, float] | None = None) -> float:
     """The standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed: that of a line
-    fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the logarithm of the size.
+    fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the logarithm of the size; or carried
+    over from a vine `like` it, which scatters as well, σ √(1 + 1 + (z − z_like)²/Σ(zᵢ − z̄)²).
     """
-    sizes = [math.log(damping_prior(*size)) for size in PRINTED_SIZES.values()]
-    middle = sum(sizes) / len(sizes)
-    distance = math.log(damping_prior(diameter_m, thickness_m)) - middle
-    leverage = 1 / len(sizes) + distance**2 / sum((size - middle) ** 2 for size in sizes)
-    return damping_scatter() * math.sqrt(1 + leverage)
+    printed = [math.log(damping_prior(*each)) for each in PRINTED_SIZES.values()]
+    middle = sum(printed) / len(printed)
+    start, doubt = (middle, 1 / len(printed)) if like is None else (math.log(damping_prior(*like)), 1.0)
+    distance = math.log(damping_prior(*size)) - start
+    return damping_scatter() * math.sqrt(1 + doubt + distance**2 / sum((each - middle) ** 2 for each in printed))
 
 
 def _split_leverage(diameter_m: float, thickness_m: float) -> float:
@@ -396,11 +397,7 @@ class _Assembly:
             self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
             # The uncertainties are the scatter of the printed values about the prior, and the exponents of t against D.
-            prior, split, scatter = (
-                damping_prior(*self.size),
-                _split_leverage(*self.size),
-                damping_log_sigma(*self.size),
-            )
+            prior, split, like = damping_prior(*self.size), _split_leverage(*self.size), None
             if self.fit is None or place is None:
                 self.set(DAMPING, prior, "B_guessed")
             else:
@@ -408,6 +405,7 @@ class _Assembly:
                 self.set_fitted(DAMPING, place, prior / damping_prior(*like), "B_scaled", vine=self.vine)
                 self.notes.append(remark("B_carried_over", source=self.fit.source, vine=self.vine))
                 split -= _split_leverage(*like)
+            scatter = damping_log_sigma(self.size, like)
             why = remark("printed_B_scatter", printed=100 * damping_scatter(), here=100 * scatter, dof=SCATTER_DOF)
             self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, log=True, dof=SCATTER_DOF)
             if abs(split) > 1e-9:
