@@ -128,7 +128,7 @@ def measure(tie: Tie, seed: int) -> dict[str, float] | None:
     pairs = grown(list(with_names([replace(trial, **rig) for trial in trials])), tie, seed)
     fits = fitted(pairs, tie)
     begin = time.process_time()
-    found = next_experiment(fits, tie.limits, seed=seed)
+    found = next_experiment(fits, tie.limits)
     spent = time.process_time() - begin
     if not found.trials:
         return None
