@@ -56,7 +56,7 @@ def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits
     table = ladder(fits, ["", DEPLETION])
     assert table["added"].tolist() == ["", DEPLETION]
     # Laid on the last model: far off, the first one would make replicates differ by more than they do.
-    assert table["floor_m"].tolist() == [in_sample(fits[1]).floor_m] * 2
+    assert table["floor_m"].tolist() == [align_trials(fits[1]).floor_m] * 2
     before, after = (table.iloc[k] for k in range(2))
     for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
         assert before[column] > 1.25 * after[column]
@@ -86,11 +86,11 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs)
 
 def test_in_sample_error_and_floor_are_those_of_the_comparison(fits, pairs):
     table = compare(fits[0], pairs).table
-    errors = in_sample(fits[0])
-    assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
-    assert errors.floor_m == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
+    floor_m = align_trials(fits[0]).floor_m
+    assert in_sample(fits[0]).rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
+    assert floor_m == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
     # Laid on another model, replicates differ as much.
-    assert in_sample(fits[1]).floor_m == pytest.approx(errors.floor_m, rel=0.03)
+    assert align_trials(fits[1]).floor_m == pytest.approx(floor_m, rel=0.03)
     assert (excess(5.0, 3.0), excess(1.0, 3.0)) == (4.0, 0.0)
     assert math.isnan(excess(1.0, math.nan))
 
@@ -138,7 +138,7 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
     assert sorted(one.trial.name for one in left_out(found).trials) == sorted(trial.name for trial, _ in lower)
     assert sorted(one.trial.name for one in highest_pressure(found).trials) == ["R2_48kPa_1", "R4_38kPa_1"]
     # Without replicates there is no floor.
-    assert math.isnan(in_sample(found).floor_m)
+    assert math.isnan(align_trials(found).floor_m)
     assert math.isnan(ladder([found], [""])["excess_left_out_m"].iloc[0])
 
 

@@ -147,12 +147,6 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     return Replicates(trials, frames.drop(columns=["residual_m", "moves"]), instants)
 
 
-def replicates_by_condition(trials: Sequence[TrialFit]) -> dict[str, Replicates]:
-    """The replicates of each condition, in order."""
-    names = dict.fromkeys(trial.trial.condition for trial in trials)
-    return {name: replicates_of([trial for trial in trials if trial.trial.condition == name]) for name in names}
-
-
 def first_that_counts(trial: TrialFit) -> int:
     """Index of the frame where model or measurement begins to move: a standstill would only dilute an error."""
     released = int(np.searchsorted(trial.time_s, trial.release_s))
@@ -191,13 +185,28 @@ class AlignedTrials:
         return courses
 
     @cached_property
+    def together(self) -> dict[str, Replicates]:
+        """The replicates of each condition, by its name, in order."""
+        names = dict.fromkeys(trial.trial.condition for trial in self.trials)
+        return {name: replicates_of([one for one in self.trials if one.trial.condition == name]) for name in names}
+
+    @property
+    def floor_m(self) -> float:
+        """Replicate floor over all conditions with replicates, m; NaN where none has any. Root of the mean variance of
+        the conditions, weighted by their numbers of trials.
+        """
+        groups = [group for group in self.together.values() if math.isfinite(group.floor_m)]
+        counts = [len(group.trials) for group in groups]
+        return math.sqrt(np.average([group.floor_m**2 for group in groups], weights=counts)) if groups else math.nan
+
+    @cached_property
     def scatter(self) -> Scatter:
         """The multiple of the typical scatter at which an adequate model would be off by the replicate floor; 1 where
         no pressure or B moves the trials.
         """
-        together, beyond, typical, dof = replicates_by_condition(self.trials), 0.0, 0.0, 0
+        beyond, typical, dof = 0.0, 0.0, 0
         for condition, members in self.courses.items():
-            if not math.isnan(floor_m := together[condition].floor_m):
+            if not math.isnan(floor_m := self.together[condition].floor_m):
                 beyond += sum(floor_m**2 - member.noise_m2 for member in members)
                 typical += sum(float(np.trace(member.typical_m2)) for member in members)
                 dof += len(members) - 1
@@ -374,7 +383,7 @@ def compare(
     measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
     final = _final_speed_errors(aligned, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
-    for condition, together in replicates_by_condition(aligned.trials).items():
+    for condition, together in aligned.together.items():
         known = [final[trial.name] for trial in together.trials if math.isfinite(final[trial.name])]
         rows.append(
             {
@@ -472,15 +481,6 @@ class Errors:
         """Root mean square position error in motion, see `rms_of`."""
         return rms_of(self.trials)
 
-    @property
-    def floor_m(self) -> float:
-        """Replicate floor over all conditions with replicates, m; NaN where none has any. Root of the mean variance of
-        the conditions, weighted by their numbers of trials.
-        """
-        groups = [group for group in replicates_by_condition(self.trials).values() if math.isfinite(group.floor_m)]
-        counts = [len(group.trials) for group in groups]
-        return math.sqrt(np.average([group.floor_m**2 for group in groups], weights=counts)) if groups else math.nan
-
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
     """Compute the errors of the initial model and of every enlarged one, the last `partial` of them without a claim.
@@ -491,10 +491,10 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
 
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
-    inside = [in_sample(each) for each in fits]
     settled = len(fits) - partial - 1
-    floor_m, aligned = inside[settled].floor_m, align_trials(fits[settled])
-    courses = list(itertools.chain(*aligned.courses.values()))
+    aligned = align_trials(fits[settled])
+    inside_m = [rms_of(aligned.trials) if k == settled else in_sample(fit).rms_m for k, fit in enumerate(fits)]
+    floor_m, courses = aligned.floor_m, list(itertools.chain(*aligned.courses.values()))
     expected = expected_error(courses, aligned.scatter, parameter_error(aligned))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
@@ -502,7 +502,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
             {
                 "model": "+".join(enlarged.model.names),
                 "added": name,
-                "rms_in_sample_m": inside[place].rms_m,
+                "rms_in_sample_m": inside_m[place],
                 "rms_left_out_m": outside.rms_m,
                 "rms_highest_pressure_m": highest.rms_m,
                 "floor_m": floor_m,

@@ -27,7 +27,6 @@ from vinetrack.diagnosis.ladder import (
     mean_square,
     orthogonal_part,
     position_errors,
-    replicates_by_condition,
     within_groups,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
@@ -89,8 +88,8 @@ def locate(fit: Fit) -> Failure:
     import pandas as pd
 
     aligned = align_trials(fit)
-    along, together = _residual_along_growth(aligned), replicates_by_condition(aligned.trials)
-    rows = [_condition_row(together[name], aligned.courses[name], aligned.scatter, along) for name in together]
+    along = _residual_along_growth(aligned)
+    rows = [_condition_row(of, aligned.courses[name], aligned.scatter, along) for name, of in aligned.together.items()]
     return Failure(
         pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
