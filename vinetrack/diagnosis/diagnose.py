@@ -1,6 +1,7 @@
 """Diagnose an experiment: what its model lacks, how certain that is, how far the error falls, and what to do next.
 
-diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
+diagnosis = vinetrack.diagnose("my_experiment")
+print(diagnosis)
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 @in_one_blas_thread
 def diagnose(
-    source: Fit | Experiment | Path | str | Pairs,
+    source: Fit | Experiment | Pairs,
     *,
     model: Model | None = None,
     tracks: Mapping[str, Track] | None = None,
@@ -70,12 +70,10 @@ def diagnose(
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
-    from vinetrack.experiment.folder import Experiment, read_experiment
+    from vinetrack.experiment.folder import Experiment
 
     if isinstance(source, Fit):
         fitted, model, source = source, source.model, source.pairs
-    if isinstance(source, (str, Path)):
-        source = read_experiment(source)
     if isinstance(source, Experiment):
         settings, own_effects = source.settings, source.user_effects
         model = model or make_model(settings.model, own_effects)

@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -32,7 +31,7 @@ from vinetrack.dynamics.model import Model, host_for
 from vinetrack.effects import Effect, catalogue, find_effect
 from vinetrack.inference.errors import root_without, trial_information
 from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, fit_subset, predict_prepared, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
@@ -42,8 +41,6 @@ from vinetrack.tracks.position_noise import rest_points
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from vinetrack.experiment.folder import Experiment
 
 
 # ------------------------------------------------------------------------------
@@ -370,17 +367,16 @@ def comparison_lines(compared: pd.DataFrame) -> list[str]:
 @in_one_blas_thread
 def compare(
     fit: Fit,
-    experiment: Experiment | Path | str | Pairs,
+    pairs: Pairs,
     *,
-    tracks: Mapping[str, Track] | None = None,
     kinematics: Mapping[str, Kinematics] | None = None,
     final_at_fraction: float = FINAL_AT_FRACTION,
 ) -> Comparison:
-    """Compare a fitted model with the trials of an experiment."""
+    """Compare a fitted model with trials."""
     import pandas as pd
 
     aligned = align_trials(fit)
-    measured = {trial.name: track for trial, track in pairs_of(experiment, tracks)[0]}
+    measured = {trial.name: track for trial, track in pairs}
     final = _final_speed_errors(aligned, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
     for condition, together in aligned.together.items():

@@ -513,7 +513,7 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     ----------
     fitted : a fit; or any source of trials, to which the model of the experiment (else the base model) is first fitted.
     source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
-    options : options of `vinetrack.diagnosis.ladder.compare`, such as `final_at_fraction` and `tracks`.
+    options : `tracks`, and options of `vinetrack.diagnosis.ladder.compare`, such as `final_at_fraction`.
 
     Returns
     -------
