@@ -181,13 +181,9 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     inputs = prediction.inputs
     yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
-    rows = []
-    for one in inputs.bands():
-        if one.why.code != "constant":  # constants of nature are left out
-            in_sheet = inputs.trial.pressure_unit
-            low, median, high = (value_in_unit(value, one.unit, in_sheet) for value in (one.low, one.median, one.high))
-            band = "–" if one.low == one.high else f"{low} to {high}"
-            rows.append((one.symbol, median, band, display_unit(one.unit, in_sheet, PREDICTION_UNITS)[0], str(one.why)))
+    bands, unit = inputs.bands(), inputs.trial.pressure_unit
+    # Constants of nature are left out.
+    rows = [(one.symbol, *_cells(one, unit), str(one.why)) for one in bands if one.why.code != "constant"]
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     columns = ("prediction", "at y/L", "median", "90 % band", "unit")
@@ -208,16 +204,17 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     yield from (f"! {warning}" for warning in prediction.hazards)
 
 
+def _cells(one: Band, pressure_unit: str) -> tuple[str, str, str]:
+    """Return median, band and unit."""
+    low, median, high = (value_in_unit(value, one.unit, pressure_unit) for value in (one.low, one.median, one.high))
+    has_band = one.low != one.high and not math.isnan(one.median)
+    return median, f"{low} to {high}" if has_band else "–", display_unit(one.unit, pressure_unit, PREDICTION_UNITS)[0]
+
+
 def _quantity_row(quantity: Band) -> tuple[str, str, str, str, str]:
     """Return name, place, median, band and unit; stresses are in MPa."""
     place = "" if math.isnan(quantity.y_over_L) else f"{quantity.y_over_L:g}"
-    values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
-    if unit == "Pa":
-        texts, unit = [number(value / 1e6) for value in values], "MPa"
-    else:
-        texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, table=PREDICTION_UNITS)[0]
-    no_band = quantity.low == quantity.high or math.isnan(quantity.median)
-    return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
+    return quantity.name, place, *_cells(quantity, "MPa")
 
 
 def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
