@@ -471,6 +471,7 @@ def _changes(changes: Sequence[tuple[str, float, str]]) -> str:
 # Facts in words, by the names that `sentences.csv` gives them in place of a format
 FORMS: dict[str, Callable[[Any], str]] = {
     "and": joined,
+    "or": lambda names: joined(names, "or"),
     "is": lambda names: "is" if len(names) == 1 else "are",
     "list": ", ".join,
     "rivals": "; ".join,

@@ -122,19 +122,12 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
     verdict, answers = diagnosis.verdict, diagnosis.answer_set
     names = [shown(name) for name in (diagnosis.effects if verdict == MISSING else ()) or answers]
     if diagnosis.contradicted_columns:
-        return f"{joined(diagnosis.contradicted_columns)} in the sheet cannot fit the measurements: correct it first"
-    if answers == (DROPPED_FRAMES,):
-        return "frames are missing from the recordings"
-    if verdict == ARTEFACT and trials_differ(answers):
-        how = " or ".join(map(difference_text, answers))
-        return f"the trials differ, and no physics is missing: {how}"
-    return {
-        MISSING: f"{joined(names)} {'is' if len(names) == 1 else 'are'} missing",
-        AMBIGUOUS: f"{joined(names, 'or')} is missing, and these trials cannot tell which",
-        ARTEFACT: f"a fault of the measurement, not missing physics: {joined(names, 'or')}",
-        ADEQUATE: "no missing effect can be detected",
-        UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
-    }.get(verdict, "no diagnosis could be made")
+        verdict, names = "sheet_contradicted", list(diagnosis.contradicted_columns)
+    elif answers == (DROPPED_FRAMES,):
+        verdict = DROPPED_FRAMES
+    elif verdict == ARTEFACT and trials_differ(answers):
+        verdict, names = "only_trials_differ", list(map(difference_text, answers))
+    return sentence(verdict or "no_verdict", {"names": names})
 
 
 def verdict_table(diagnosis: Diagnosis) -> list[Row]:
@@ -155,18 +148,19 @@ def verdict_table(diagnosis: Diagnosis) -> list[Row]:
     return [row for row in rows if row.answer]
 
 
+# Codes of what is said once all that was found is in the model, by the last verdict
+_THEREAFTER = {
+    ADEQUATE: "nothing_further", AMBIGUOUS: "one_of_these_too", ARTEFACT: "a_fault_remains", UNEXPLAINED: "still_fails",
+}  # fmt: skip
+
+
 def _thereafter(diagnosis: Diagnosis) -> str:
     """What the model lacks once all that was found is in it; blank where that is the verdict itself."""
     if not diagnosis.effects or diagnosis.contradicted_columns:
         return ""
-    it = "it" if len(diagnosis.effects) == 1 else "them"
     last = diagnosis.rounds[-1]
-    return {
-        ADEQUATE: f"With {it} in the model, no further effect can be detected.",
-        AMBIGUOUS: f"A further effect is missing: {listed_names(last.answer_set, 'or')}.",
-        ARTEFACT: f"What remains is a fault of the measurement: {listed_names(last.answer_set, 'or')}.",
-        UNEXPLAINED: f"With {it} in the model, it still fails, and no effect of the catalogue explains the rest.",
-    }.get(last.verdict, "")
+    facts = {"several": len(diagnosis.effects) > 1, "names": list(map(spaced_name, last.answer_set))}
+    return sentence(_THEREAFTER[last.verdict], facts) if last.verdict in _THEREAFTER else ""
 
 
 def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
