@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import LEAST_SCATTER, align_trials
-from vinetrack.dynamics.audit import evaluate
+from vinetrack.dynamics.audit import Terms, evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
@@ -63,7 +64,7 @@ MOST_OF_LENGTH = 0.96  # Part of the length up to which points are used: a moved
 @dataclass(frozen=True)
 class FittedMotion:
     """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI. `model` and `trial`
-    are those of its parameters; `mass_kg` is all moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ.
+    are those of its parameters, `push` is a force beside the model's; `acceleration` is that of the tail.
     """
 
     trial: Trial
@@ -75,12 +76,42 @@ class FittedMotion:
     acceleration: Floats
     observed_slope: Floats
     observation_offset_m: Floats
-    counts_until_s: float
-    pressure_Pa: Floats
-    mass_kg: Floats
-    model_acceleration: Floats
-    stiffness: Floats
-    friction: Floats
+    counts_until_s: float = math.inf
+    push: Push | None = None
+
+    @cached_property
+    def terms(self) -> Terms:
+        """The terms of the model along the motion."""
+        y, v = self.lead_position_m, self.lead_velocity_m_s
+        return evaluate(self.model, self.trial, self.time_s, y, v, measured_Pa=self.measured_Pa)
+
+    @property
+    def pressure_Pa(self) -> Floats:
+        """Driving pressure, Pa."""
+        return np.broadcast_to(self.terms.pressure_Pa, self.time_s.shape)
+
+    @property
+    def mass_kg(self) -> Floats:
+        """All moving mass, kg."""
+        return np.broadcast_to(self.terms.inertia_kg, self.time_s.shape)
+
+    @property
+    def pushed_acceleration(self) -> Floats:
+        """The acceleration by the model and the force beside it, m/s²."""
+        by_push = 0.0 if self.push is None else self.push(self) / self.mass_kg
+        return np.asarray(self.terms.acceleration_m_s2 + by_push)
+
+    @cached_property
+    def derivatives(self) -> tuple[Floats, Floats]:
+        """Stiffness and friction: derivatives of that acceleration by position and velocity of the tail."""
+        y, v, r, here = self.lead_position_m, self.lead_velocity_m_s, self.trial.travel_ratio, self.pushed_acceleration
+        step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
+        further = replace(self, lead_position_m=y + step_y).pushed_acceleration
+        faster = replace(self, lead_velocity_m_s=v + step_v).pushed_acceleration
+        stands = v < LEAST_RELATIVE_SPEED * v.max()
+        late = self.time_s > self.time_s[N_STEPS // 20]
+        friction = np.where(stands & late, -1e9, np.minimum((faster - here) / (r * step_v), 0.0))
+        return np.where(stands, 0.0, (further - here) / (r * step_y)), friction
 
     @property
     def tail_position_m(self) -> Floats:
@@ -125,12 +156,10 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
         velocity = np.gradient(y, time_s)
         moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
         by_time = np.gradient(run.observed_position_m, time_s)
-        slope, nothing = np.where(moving, by_time / np.where(moving, velocity, 1.0), 1.0), np.zeros_like(y)
-        offset_m, terms = run.observed_position_m - y, [nothing] * 5  # Terms are evaluated next
-        motion = with_terms(
-            FittedMotion(trial, model, measured, time_s, y, v, nothing, slope, offset_m, math.inf, *terms)
-        )
-        motions.append(replace(motion, acceleration=motion.model_acceleration))
+        slope = np.where(moving, by_time / np.where(moving, velocity, 1.0), 1.0)
+        acceleration = np.asarray(evaluate(model, trial, time_s, y, v, measured_Pa=measured).acceleration_m_s2)
+        offset_m = run.observed_position_m - y
+        motions.append(FittedMotion(trial, model, measured, time_s, y, v, acceleration, slope, offset_m))
     return motions
 
 
@@ -140,36 +169,6 @@ def _of_job(model: Model, trial: Trial, job: Jobs) -> tuple[Model, Trial]:
     yield_Pa = trial.yield_pressure_Pa if np.isnan(job.yield_pressure_Pa) else float(job.yield_pressure_Pa)
     pressure_Pa = trial.pressure_Pa * (1 + float(job.pressure_deviation))
     return model.with_values(values), replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=yield_Pa)
-
-
-def _accelerated(motion: FittedMotion, push: Push | None) -> tuple[FittedMotion, Floats]:
-    """The motion with the terms of its model evaluated along it, and the acceleration by model and added force."""
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    terms = evaluate(motion.model, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
-    motion = replace(
-        motion,
-        pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape),
-        mass_kg=np.broadcast_to(terms.inertia_kg, y.shape),
-        model_acceleration=np.asarray(terms.acceleration_m_s2),
-    )
-    return motion, motion.model_acceleration + (0.0 if push is None else push(motion) / motion.mass_kg)
-
-
-def with_terms(motion: FittedMotion, push: Push | None = None) -> FittedMotion:
-    """The motion with the terms of its model evaluated along it; stiffness and friction include an added force."""
-    y, v, r = motion.lead_position_m, motion.lead_velocity_m_s, motion.trial.travel_ratio
-    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
-    there, acceleration = _accelerated(motion, push)
-    _, further = _accelerated(replace(motion, lead_position_m=y + step_y), push)
-    _, faster = _accelerated(replace(motion, lead_velocity_m_s=v + step_v), push)
-    stands = v < LEAST_RELATIVE_SPEED * v.max()
-    late = motion.time_s > motion.time_s[N_STEPS // 20]
-    friction = np.minimum((faster - acceleration) / (r * step_v), 0.0)
-    return replace(
-        there,
-        stiffness=np.where(stands, 0.0, (further - acceleration) / (r * step_y)),
-        friction=np.where(stands & late, -1e9, friction),
-    )
 
 
 def acceleration_sensitivities(
@@ -198,7 +197,7 @@ def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Flo
 
 def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:
     """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
-    time_s, k, c = (np.array([getattr(each, name) for each in motions]) for name in ("time_s", "stiffness", "friction"))
+    time_s, k, c = map(np.array, zip(*((motion.time_s, *motion.derivatives) for motion in motions), strict=True))
     return integrate_responses(time_s, k, c, np.array(accelerations))
 
 
@@ -233,12 +232,12 @@ def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> Fitted
     """
     r, fast = motion.trial.travel_ratio, motion.lead_velocity_m_s > 0.05 * motion.lead_velocity_m_s.max()
     slowed = np.where(dv < 0, 0.5 * motion.tail_velocity_m_s / np.maximum(-dv, 1e-12), 1.0)
-    part = float(np.min(slowed, initial=1.0, where=fast))
+    part, (stiffness, friction) = float(np.min(slowed, initial=1.0, where=fast)), motion.derivatives
     return replace(
         motion,
         lead_position_m=np.maximum(motion.lead_position_m + part * dx / r, 0.0),
         lead_velocity_m_s=np.maximum(motion.lead_velocity_m_s + part * dv / r, 0.0),
-        acceleration=motion.acceleration + part * (motion.stiffness * dx + motion.friction * dv + push),
+        acceleration=motion.acceleration + part * (stiffness * dx + friction * dv + push),
     )
 
 
@@ -357,11 +356,10 @@ class ForceProblem:
         by_parameter = [*(predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)), here]
         moved, derivatives = [], []
         for i, (motion, index) in enumerate(zip(motions, predictor.layout.index, strict=True)):
-            moved.append(with_terms(self._with_job(motion, here[i]), push))
-            before = _accelerated(moved[i], push)[1]
+            moved.append(replace(self._with_job(motion, here[i]), push=push))
             jobs = [jobs[i] for jobs in (*by_effect, *(by_parameter[k] for k in index))]
-            after = [_accelerated(self._with_job(motion, job), push)[1] for job in jobs]
-            derivatives.append((np.column_stack(after) - before[:, None]) / step)
+            after = [self._with_job(moved[i], job).pushed_acceleration for job in jobs]
+            derivatives.append((np.column_stack(after) - moved[i].pushed_acceleration[:, None]) / step)
         return ForcePoint(theta, trial_effects, moved, derivatives)
 
     def _with_job(self, motion: FittedMotion, job: Jobs) -> FittedMotion:
@@ -388,7 +386,7 @@ class ForceEquations:
             np.column_stack([
                 columns,
                 push / motion.mass_kg[:, None],
-                motion.model_acceleration + push @ self.coefficients / motion.mass_kg - motion.acceleration,
+                motion.terms.acceleration_m_s2 + push @ self.coefficients / motion.mass_kg - motion.acceleration,
             ])
             for motion, columns, push in zip(point.motions, point.by_parameters, pushes, strict=True)
         ]  # fmt: skip
