@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
 from vinetrack.diagnosis.between_trials import BETWEEN, ORDER_DRIFT, SPECIMEN
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -433,7 +434,8 @@ def explain(step: SelectionStep) -> str:
     best = answers[0]
     facts: dict[str, Any] = {"name": best.names[0] if step.note else best.names[-1], "model": model, "trials": trials}
     facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
-    facts |= {"hypotheses": "; ".join(map(hypothesis_in_words, answers))}
+    reach = ANSWER_SET_DELTA_CHI2 * best.inflation
+    facts |= {"hypotheses": "; ".join(map(hypothesis_in_words, answers)), "reach": reach}
     text = sentence(_EXPLAINED[verdict], facts)
     if step.note:
         note = str(step.note)
