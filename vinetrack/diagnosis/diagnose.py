@@ -298,15 +298,9 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
     from vinetrack.diagnosis.missing_force import missing_force
 
     force = missing_force(result.fits[0])
-    explanation = f"{result.explanation} {force.sentence}"
-    learned = None if force.learned is None else force.learned.table
-    return replace(
-        result,
-        missing_force=force.to_json(),
-        force_table=force.table,
-        learned_table=learned,
-        explanation=explanation if force.learned is None else f"{explanation} {force.learned.sentence}",
-    )
+    told = (force.sentence, *([force.learned.sentence] if force.learned else []))
+    explanation = " ".join(map(str, (result.explanation, *told)))
+    return replace(result, missing_force=force.to_json(), force=force, explanation=explanation)
 
 
 # ------------------------------------------------------------------------------

@@ -23,10 +23,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.locate import Failure
+    from vinetrack.diagnosis.missing_force import MissingForce
 
     Table = pd.DataFrame
 else:
-    Table = Failure = Any  # Records do not look into what no file holds
+    Table = Failure = MissingForce = Any  # Records do not look into what no file holds
 
 
 # ------------------------------------------------------------------------------
@@ -349,8 +350,7 @@ class Diagnosis(Printed, Drawn, JsonRecord):
     missing_force: Mapping[str, Any] | None = None
     notes: Sentences = ()
     failure: Annotated[Failure | None, Field(exclude=True)] = None
-    force_table: Annotated[Table | None, Field(exclude=True)] = None
-    learned_table: Annotated[Table | None, Field(exclude=True)] = None
+    force: Annotated[MissingForce | None, Field(exclude=True)] = None
     stored_parameters: Annotated[tuple[Number, ...], Field(alias="parameters")] = ()
     contradicted_columns: tuple[str, ...] = ()
     not_tried: tuple[str, ...] = ()

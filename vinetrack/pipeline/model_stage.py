@@ -215,14 +215,18 @@ def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataF
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Return the tables of the initial model's misfit and of the missing force, by file name."""
-    tables = {"missing_force.csv": diagnosis.force_table, "learned_force.csv": diagnosis.learned_table}
+    tables: dict[str, pd.DataFrame] = {}
+    if (force := diagnosis.force) is not None:
+        tables["missing_force.csv"] = force.table
+        if force.learned is not None:
+            tables["learned_force.csv"] = force.learned.table
     if (failure := diagnosis.failure) is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
             "along_position.csv": failure.along_position,
             "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
-    return {name: table for name, table in tables.items() if table is not None}
+    return tables
 
 
 def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
