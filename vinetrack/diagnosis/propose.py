@@ -279,24 +279,22 @@ def _fitted(
     """
     if not forces:
         return before, []
-    files: list[tuple[str, str, Callable[[str], str]]] = []
+    made: list[tuple[str, Callable[[str], str], Effect]] = []
     for force in forces:
         if isinstance(force, RankedLaw):
-            files.append((f"proposed_{force.law.name}", force.words, partial(effect_text, force)))
+            name, words, text = f"proposed_{force.law.name}", force.words, partial(effect_text, force)
         else:
             name = "_".join(["learned", *force.domain.variables])
-            files.append((name, str(force.sentence), partial(table_text, force)))
-    effects = []
-    for name, _, text in files:
+            words, text = str(force.sentence), partial(table_text, force)
         path = folder / f"{name}.py"
         path.write_text(text(""), encoding="utf-8")
         remember(path)
-        effects.append(load_effect(path))
-    before, found = with_host(before, Model((*before.model, probe(), *effects))), []
-    for (_, words, text), effect in zip(files, effects, strict=True):
+        made.append((words, text, load_effect(path)))
+    before, found = with_host(before, Model((*before.model, probe(), *(effect for *_, effect in made)))), []
+    for words, text_of, effect in made:
         with suppress(FitError):
             ratio = likelihood_ratio(before, (effect,), fit_with(before, effect, report))
-            found.append(Proposed(words, text, effect, ratio))
+            found.append(Proposed(words, text_of, effect, ratio))
     return before, found
 
 
