@@ -85,7 +85,9 @@ def diagnose(
     pairs, left_out = pairs_of(source, tracks)
     if not isinstance(source, Experiment):  # whose tracks were corrected as they were read
         pairs = [(trial, track if trial.video else correct_frames(track)) for trial, track in pairs]
-    dropped = lost_frames(pairs)
+    # Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain
+    retimed = [(trial.name, track) for trial, track in pairs if with_flag(track.flag, "retimed").any()]
+    dropped = {name: frames_surely_missing(track) for name, track in retimed}
     report("fitting the model")
     if fitted is None or dropped:
         fit = initial_fit(model, pairs, effects)
@@ -393,13 +395,6 @@ def _force_N(trial: Trial, pressure_Pa: float) -> float:
 
 # ------------------------------------------------------------------------------
 # Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
-
-
-def lost_frames(pairs: Pairs) -> dict[str, bool]:
-    """Trials whose times were corrected for dropped frames, each with whether it has dropped some for certain."""
-    return {
-        trial.name: frames_surely_missing(track) for trial, track in pairs if with_flag(track.flag, "retimed").any()
-    }
 
 
 def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:

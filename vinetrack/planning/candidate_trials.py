@@ -33,7 +33,7 @@ from vinetrack.inference.sensitivity import (
     initial_trial_effects,
 )
 from vinetrack.inference.solving import trial_fit
-from vinetrack.planning.predictive_inputs import hoop_stress_Pa, prior_ratio
+from vinetrack.planning.predictive_inputs import damping_prior, hoop_stress_Pa
 from vinetrack.tracks.position_noise import ar1_noise
 
 # ------------------------------------------------------------------------------
@@ -227,7 +227,8 @@ def extended(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> tuple[Pre
         row, values = old.index[condition.like].copy(), np.array(fitted_rows[condition.like])
         is_new = trial.vine != like.vine
         if is_new and fit.predictor.damping_column >= 0:
-            values[fit.predictor.damping_column] *= prior_ratio(trial, like)
+            prior, known = (damping_prior(vine.diameter_m, vine.thickness_m) for vine in (trial, like))
+            values[fit.predictor.damping_column] *= prior / known
         for column, key in enumerate(old.keys):
             if is_new and row[column] >= 0 and (of_like := old.free[row[column]]).vine:
                 if (key, trial.vine) not in places:

@@ -64,11 +64,6 @@ def damping_prior(diameter_m: float, thickness_m: float) -> float:
     return DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
-def prior_ratio(trial: Trial, like: Trial) -> float:
-    """The ratio of the priors of B of two vines."""
-    return damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(like.diameter_m, like.thickness_m)
-
-
 def damping_scatter() -> float:
     """The standard deviation of ln B of the four printed values about the prior.
 
