@@ -199,11 +199,9 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     return bool(np.sum(in_conditions**2) / inner_degrees < 0.5 * np.sum(in_vines**2) / max(outer_degrees, 1))
 
 
-# What lists the forms of a hypothesis, given its name, that the trials of a fit, linearised at a solution, can test
-Forms = Callable[[str, Fit, Solution], Sequence[Difference]]
-
-# Hypotheses that trials differ, by their names in an answer set; standard deviations are chosen
-BETWEEN: dict[str, Forms] = {
+# Hypotheses that trials differ, by their names in an answer set: what lists their forms, given this name, that the
+# trials of a fit, linearised at a solution, can test; standard deviations are chosen
+BETWEEN: dict[str, Callable[[str, Fit, Solution], Sequence[Difference]]] = {
     N_BY_VINE: _of_vines,
     ORDER_DRIFT: _of_order,
     SPECIMEN: partial(_of_specimens, B_sd=0.06, pressure_sd_Pa=300.0),

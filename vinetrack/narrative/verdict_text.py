@@ -149,19 +149,15 @@ def verdict_table(diagnosis: Diagnosis) -> list[Row]:
     return [row for row in rows if row.answer]
 
 
-# Codes of what is said once all that was found is in the model, by the last verdict
-_THEREAFTER = {
-    ADEQUATE: "nothing_further", AMBIGUOUS: "one_of_these_too", ARTEFACT: "a_fault_remains", UNEXPLAINED: "still_fails",
-}  # fmt: skip
-
-
 def _thereafter(diagnosis: Diagnosis) -> str:
     """What the model lacks once all that was found is in it; blank where that is the verdict itself."""
     if not diagnosis.effects or diagnosis.contradicted_columns:
         return ""
     last = diagnosis.rounds[-1]
     facts = {"several": len(diagnosis.effects) > 1, "names": list(map(spaced_name, last.answer_set))}
-    return sentence(_THEREAFTER[last.verdict], facts) if last.verdict in _THEREAFTER else ""
+    codes = {ADEQUATE: "nothing_further", AMBIGUOUS: "one_of_these_too", ARTEFACT: "a_fault_remains"}
+    code = (codes | {UNEXPLAINED: "still_fails"}).get(last.verdict)
+    return sentence(code, facts) if code else ""
 
 
 def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
