@@ -82,10 +82,7 @@ POWER = Power(
 
 def verdicts() -> str:
     told = [Diagnosis.from_json(diagnosis(verdict)) for verdict in VERDICTS]
-    parts = []
-    for said in told:
-        parts.append("\n".join([verdict_sentence(said), "", str(said)]))
-    return "\n\n----\n".join(parts)
+    return "\n\n----\n".join("\n".join([verdict_sentence(said), "", str(said)]) for said in told)
 
 
 def power() -> str:
@@ -158,6 +155,13 @@ def test_sizes_are_those_fitted_together_with_the_fault_that_remains():
         stored_parameters=(alone,),
     )  # fmt: skip
     assert "γ = 1.400" in {row.question: row.answer for row in verdict_table(found)}["How large"]
+
+
+def test_a_tail_that_goes_slack_is_a_setting_and_no_effect_to_add():
+    slack = Diagnosis(rounds=(Round(verdict="missing", model=("gravity",)),), effects=("tail_slack", "air_drag"))
+    assert slack.final_model == ("gravity", "air_drag")
+    todo = verdict_table(slack)[-1].answer
+    assert ("`tail_slack: free`" in todo, "vinetrack add" in todo) == (True, False)
 
 
 def test_what_a_blank_column_kept_from_being_tried_comes_first():

@@ -22,8 +22,10 @@ from vinetrack.inference.fit_result import Fit, Number, OrNaN, or_open
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.core.records import Track, Trial
     from vinetrack.diagnosis.locate import Failure
     from vinetrack.diagnosis.missing_force import MissingForce
+    from vinetrack.inference.fit_data import Pairs
 
     Table = pd.DataFrame
 else:
@@ -259,6 +261,8 @@ REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"  
 
 DROPPED_FRAMES = "dropped_frames"  # Member of an answer set where a recording has dropped frames
 
+TAIL_SLACK = "tail_slack"  # The rule that a tail cannot push, as a hypothesis: no effect, but a setting of the trials
+
 EXPECTED = ["expected_m", "expected_low_m", "expected_high_m"]  # Columns of the error of an adequate model
 
 MAX_STRETCHES = 8  # Most stretches of the growth over which a diagnosis and its figures average residuals (chosen)
@@ -396,7 +400,17 @@ class Diagnosis(Printed, Drawn, JsonRecord):
     @property
     def final_model(self) -> tuple[str, ...]:
         """Names of the effects of the final model."""
-        return (*self.initial_model, *(name for name in self.effects if name not in self.initial_model))
+        return (*self.initial_model, *(name for name in self.added if name not in self.initial_model))
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """The effects added, as a model takes them."""
+        return tuple(name for name in self.effects if name != TAIL_SLACK)
+
+    def settled(self, pairs: Pairs) -> list[tuple[Trial, Track]]:
+        """Trials as the final model has them: their tails may go slack where that was found."""
+        is_free = TAIL_SLACK in self.effects
+        return [(replace(trial, tail_slack="free") if is_free else trial, track) for trial, track in pairs]
 
     @property
     def parameters(self) -> tuple[Number, ...]:

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -46,7 +45,16 @@ from vinetrack.diagnosis.misfit_tests import (
     plausible_range,
     slip_of,
 )
-from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
+from vinetrack.diagnosis.result import (
+    ADEQUATE,
+    AMBIGUOUS,
+    ARTEFACT,
+    BETWEEN_TRIALS,
+    MISSING,
+    TAIL_SLACK,
+    UNEXPLAINED,
+    Confounder,
+)
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
@@ -336,13 +344,7 @@ def sizes_not_excluded(estimate: float, sigma: float, size: Parameter) -> tuple[
 # has no parameter, so that any rise of the likelihood is due to it alone.
 
 # Stands for the rule in answer sets
-TAIL_SLACK = Effect(
-    name="tail_slack",
-    summary="Tail slack: a tail cannot push.",
-    text="Tail slack: a tail cannot push.\n\n    tension ≥ 0\n\nReduce it with a lighter payload or a higher pressure.",
-    functions=MappingProxyType({}),
-    path=Path(__file__).resolve(),
-)
+_SLACK = Effect(name=TAIL_SLACK, summary=TAIL_SLACK, text=TAIL_SLACK, functions={}, path=Path(TAIL_SLACK))
 
 
 def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
@@ -356,7 +358,7 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
     after = full_fit(slack, afresh=has_excess_scatter(fit))
-    return None if after is None else likelihood_ratio(fit, (TAIL_SLACK,), after)
+    return None if after is None else likelihood_ratio(fit, (_SLACK,), after)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from vinetrack.diagnosis.result import (
     MISSING,
     NOT_TESTABLE,
     REFITTED,
+    TAIL_SLACK,
     UNEXPLAINED,
     Confounder,
 )
@@ -295,6 +296,8 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         return "correct the sheet and run again", f"{told} With the sheet as it is, the verdict is {verdict}."
     if diagnosis.odd_trials:
         return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
+    if TAIL_SLACK in diagnosis.effects:
+        return "write `tail_slack: free` in experiment.yaml, and run again", ""
     if UNEXPLAINED in (verdict, last):
         if diagnosis.not_tried:
             return f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}: not tried so far", ""

@@ -255,8 +255,8 @@ def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tupl
         raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
-    model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), experiment.user_effects)
-    proposal = propose(model, measured_trials(experiment, results), report)
+    model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.added]), experiment.user_effects)
+    proposal = propose(model, diagnosis.settled(measured_trials(experiment, results)), report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}

@@ -441,10 +441,9 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
     experiment: Experiment | None = None
     if (target / PROVENANCE).exists():
         results, experiment = Results(target), read_source_experiment(target, request.experiment)
-        diagnosis = read_diagnosis(results)
+        diagnosis, pairs = read_diagnosis(results), measured_trials(experiment, results)
         if diagnosis is not None and diagnosis.final_verdict == ADEQUATE:
-            added = diagnosis.effects
-        pairs: Pairs = measured_trials(experiment, results)
+            added, pairs = diagnosis.added, diagnosis.settled(pairs)
     else:
         with suppress(ExperimentError):  # recordings that do not exist yet: a plan
             experiment = read_experiment(target) if target.is_dir() else None
