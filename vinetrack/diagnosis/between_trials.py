@@ -18,13 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import within_groups
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, full_fit, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, full_fit, likelihood_ratio, stand_in
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
@@ -350,12 +349,4 @@ def _effect_of(difference: Difference) -> Effect:
     parameters = [
         Parameter(key.split(".")[1], symbol, unit, 0.0, plausible=plausible) for key, symbol, unit in described
     ]
-    return Effect(
-        name=difference.name,
-        kind=BETWEEN_TRIALS,
-        summary=difference.name,
-        text=difference.name,
-        parameters=tuple(parameters),
-        functions={},
-        path=Path(difference.name),
-    )
+    return stand_in(difference.name, BETWEEN_TRIALS, tuple(parameters))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from vinetrack.diagnosis.misfit_tests import CandidateShape, is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect
+from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
@@ -222,6 +223,11 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
 # ------------------------------------------------------------------------------
 # Fits of hypotheses.
+
+
+def stand_in(name: str, kind: str = "physical", parameters: tuple[Parameter, ...] = ()) -> Effect:
+    """What stands for a hypothesis that is no effect in tables of candidates and answer sets."""
+    return Effect(name=name, kind=kind, summary=name, text=name, parameters=parameters, functions={}, path=Path(name))
 
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from pathlib import Path
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     likelihood_ratio,
     robust_ratio,
     sizes_of,
+    stand_in,
     start_values,
     with_curves,
     without_curves,
@@ -343,9 +343,6 @@ def sizes_not_excluded(estimate: float, sigma: float, size: Parameter) -> tuple[
 # falls faster than the tip everts: the real tail goes slack there, but the model predicts that it pushes. The rule
 # has no parameter, so that any rise of the likelihood is due to it alone.
 
-# Stands for the rule in answer sets
-_SLACK = Effect(name=TAIL_SLACK, summary=TAIL_SLACK, text=TAIL_SLACK, functions={}, path=Path(TAIL_SLACK))
-
 
 def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     """Refit the model with tails that may go slack; None where no taut tail has a payload that could run ahead, or the
@@ -358,7 +355,7 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
     after = full_fit(slack, afresh=has_excess_scatter(fit))
-    return None if after is None else likelihood_ratio(fit, (_SLACK,), after)
+    return None if after is None else likelihood_ratio(fit, (stand_in(TAIL_SLACK),), after)
 
 
 @dataclass(frozen=True)
