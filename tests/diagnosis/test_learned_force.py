@@ -36,10 +36,8 @@ def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_fir
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # The second and the last but one lie at the ends: one whole apart.
     assert covariance[1, -2] == pytest.approx(ALIKE)
-    root, ends = (
-        smooth.root_of_covariance(12, 0.4, zero_at_start=True),
-        smooth.splines(np.array([0.0, 1.0]), 12),
-    )
+    root = smooth.root_of_covariance(12, 0.4, zero_at_start=True)
+    ends = smooth.splines(np.array([0.0, 1.0]), 12)
     assert ends @ root @ root.T @ ends[0] == pytest.approx(np.zeros(2), abs=1e-12)
 
 

@@ -16,7 +16,7 @@ from vinetrack.diagnosis import further_trials as advice
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.linear_power import planned_tests
 from vinetrack.diagnosis.result import PROBABILITIES, EffectPower, Power
-from vinetrack.experiment.schema import with_names
+from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
@@ -194,15 +194,12 @@ def fits_of(pairs: Pairs, *effects: str):
 
 
 def as_trials(found: advice.NextExperiment, like: Trial) -> list[Trial]:
-    columns = {
-        "pressure_Pa": ("pressure_kPa", 1e3), "pressure_sigma_Pa": ("pressure_kPa", 10),
-        "payload_kg": ("payload_g", 1e-3), "diameter_m": ("diameter_mm", 1e-3), "thickness_m": ("thickness_um", 1e-6),
-        "length_m": ("length_mm", 1e-3), "chamber_m3": ("chamber_l", 1e-3), "inlet_m": ("inlet_mm", 1e-3),
-    }  # fmt: skip
+    names = ("pressure_kPa", "payload_g", "diameter_mm", "thickness_um", "length_mm", "chamber_l", "inlet_mm")
+    columns = {name: COLUMNS[name] for name in names}
     made = []
     for k, entry in enumerate(found.trials):
-        settings = {field: unit * entry[column] for field, (column, unit) in columns.items()}
-        trial = replace(like, vine=entry["vine"], **settings)
+        settings = {column.field: column.scale.to_si(entry[name]) for name, column in columns.items()}
+        trial = replace(like, vine=entry["vine"], pressure_sigma_Pa=10 * entry["pressure_kPa"], **settings)
         made += [replace(trial, name=f"new{k}_{j}") for j in range(entry["replicates"])]
     return made
 

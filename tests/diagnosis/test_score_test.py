@@ -140,12 +140,8 @@ def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, resi
 @pytest.mark.parametrize("replicates_missed", [1, 2])
 def test_a_condition_that_is_missed_in_every_replicate_is_far_off_though_most_trials_are_not(replicates_missed):
     names, missed = ["low", "low", "a", "a", "b", "b", "b"], [True] * replicates_missed + [False] * 6
-    data = [
-        SimpleNamespace(
-            position_systematic_m=0.0, lead_position_m=np.array([0.0, 0.1]), trial=SimpleNamespace(condition=name)
-        )
-        for name in names
-    ]
+    trials, grown_m = [SimpleNamespace(condition=name) for name in names], np.array([0.0, 0.1])
+    data = [SimpleNamespace(position_systematic_m=0.0, lead_position_m=grown_m, trial=trial) for trial in trials]
     columns = [np.full((4, 1), 2e-3 if far else 1e-6) for far in missed[:7]]
     solution = SimpleNamespace(columns=columns)
     fit = SimpleNamespace(chi2_per_dof=900.0, predictor=SimpleNamespace(data=data), solution=solution)

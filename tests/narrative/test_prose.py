@@ -144,9 +144,8 @@ def test_nothing_is_said_of_the_scatter_of_replicates_where_there_are_none(z, co
 
 
 def test_sizes_are_those_fitted_together_with_the_fault_that_remains():
-    alone, together = (
-        Number("reservoir_depletion.gamma", "", "γ", "1", v, 0.01, v - 0.02, v + 0.02) for v in (1.8, 1.4)
-    )
+    of = ("reservoir_depletion.gamma", "", "γ", "1")
+    alone, together = (Number(*of, size, 0.01, size - 0.02, size + 0.02) for size in (1.8, 1.4))
     fault = Candidate("film_mass", kind="measurement", in_answer_set=True, along=(together,))
     found = Diagnosis(
         rounds=(Round(verdict="missing", answer_set=("reservoir_depletion",)),
