@@ -120,20 +120,24 @@ def likelihood_ratio(
     )
 
 
+def size_in_errors(effect: Effect, after: Fit) -> float:
+    """Size of an effect in standard errors; the largest where each vine has its own; infinite where none is known."""
+    sizes = [
+        abs(number.value - parameter.zero) / number.sigma
+        for parameter in effect.parameters[:1]
+        for number in after.numbers
+        if number.key == f"{effect.name}.{parameter.name}" and 0 < number.sigma < math.inf
+    ]
+    return max(sizes, default=math.inf)
+
+
 def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> Remark:
     """Say that a fitted size is smaller than its standard error; blank where none is. Such a fit is better because of
     the parameters that shape the effect, and its size is not determined.
     """
-    for effect in effects:
-        # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
-        for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
-            numbers = [number for number in after.numbers if number.key == f"{effect.name}.{parameter.name}"]
-            known = [number for number in numbers if 0 < number.sigma < math.inf]
-            # Where each vine has its own size, one that differs from zero is enough.
-            sigmas = [abs(number.value - parameter.zero) / number.sigma for number in known]
-            if sigmas and max(sigmas) < MIN_SIZE_SIGMAS:
-                return remark("size_may_be_zero")
-    return Remark()
+    # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
+    sizes = [size_in_errors(effect, after) for effect in effects if effect.kind != BETWEEN_TRIALS]
+    return remark("size_may_be_zero") if min(sizes, default=math.inf) < MIN_SIZE_SIGMAS else Remark()
 
 
 def sizes_of(effects: Sequence[Effect], after: Fit) -> int:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     is_large,
     likelihood_ratio,
     robust_ratio,
+    size_in_errors,
     sizes_of,
     stand_in,
     start_values,
@@ -152,7 +153,10 @@ class Search:
                 break
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
-        """Fit sets of this many effects, built on the best sets of one fewer."""
+        """Fit sets of this many effects, built on the best sets of one fewer. What the others have made needless in the
+        best is taken out again; what is left is built on where it is the best of its size (floating search: Pudil et
+        al., Pattern Recognition Letters 15, 1119, 1994).
+        """
         # 3, 2: best single effects from which pairs are built, and best sets from which larger ones are (chosen)
         bases = self.of_size(size - 1)[: 3 if size == 2 else 2]
         for base in bases:
@@ -160,6 +164,11 @@ class Search:
             if base.delta_chi2 >= 0.3 * bases[0].delta_chi2:
                 # 3: partners tried with each base (chosen)
                 self.extend(base, 3)
+        for best in self.of_size(size)[:1]:
+            least = min(best.effects, key=partial(size_in_errors, after=best.fit))
+            smaller = self.subset(best, [effect for effect in best.effects if effect is not least])
+            if smaller is not None and smaller.fit.log_likelihood > bases[0].fit.log_likelihood:
+                self.extend(smaller, 3)
         return self.of_size(size)
 
     def subset(
