@@ -34,7 +34,6 @@ from vinetrack.kinematics.force import (
 )
 from vinetrack.kinematics.steady import gated_window, paper_window, quasi_steady_window, user_window
 from vinetrack.kinematics.velocity import estimate_kinematics
-from vinetrack.tracks.frame_timing import correct_frames
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -193,7 +192,6 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     usable = int(track.usable.sum())
     if usable < FEWEST_POINTS:
         raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
-    track = correct_frames(track)
     kinematics = estimate_kinematics(
         track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
     )

@@ -43,6 +43,7 @@ from vinetrack.results.folder_layout import (
     read_result,
     table_of,
 )
+from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.tracks.importers import load_track, with_pressure_trace
 from vinetrack.video.axis import askew_trials, axis_entry, slope_deg
 from vinetrack.video.frames import RecordingError
@@ -86,7 +87,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     columns, view = dict[str, float](), dict[str, Any]()
     try:
         if trial is not None and trial.video is None:
-            summary = summarise_trial(trial, load_track(trial), settings, model_of(experiment))
+            summary = summarise_trial(trial, correct_frames(load_track(trial)), settings, model_of(experiment))
         elif trial is not None:
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             track, columns, view = _of_recording(trial, measurement, experiment)
