@@ -299,13 +299,13 @@ class PlaneMap:
     @classmethod
     def from_scale(cls, m_per_px: float, width_px: int, height_px: int) -> PlaneMap:
         """Make the map of a plane seen at right angles, without distortion, known without error."""
-        step_m = m_per_px * _half_diagonal_px(width_px, height_px)
+        step_m = m_per_px * float(_camera(width_px, height_px)[0, 0])
         parameters = np.array([step_m, 0, 0, 0, step_m, 0, 0, 0, 0, 0], dtype=float)
         return cls(width_px, height_px, parameters, np.zeros((N_PLANE + N_LENS, N_PLANE + N_LENS)))
 
     def plane_m(self, picture_px: Floats) -> Floats:
         """Map points of the picture to the plane. Shapes: picture_px (..., 2) → (..., 2)."""
-        return self._plane_m(self.parameters, np.asarray(picture_px, dtype=float))
+        return self._plane_m(self.parameters, picture_px)
 
     def path_rel_sigma(self, places_px: Floats) -> float:
         """Return the relative standard error of the length of a path in the plane, from the covariance. Shapes:
@@ -323,16 +323,24 @@ class PlaneMap:
         return float(np.sqrt(max(variance, 0.0)) / length_along(self.plane_m(places_px))[-1])
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
-        size = (self.width_px, self.height_px)
-        ideal = _undistorted(_half_diagonals(picture_px, size), parameters[8:])
-        homography = np.append(parameters[:8], 1.0).reshape(3, 3)
-        projected = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ homography.T
-        return np.asarray(projected[..., :2] / projected[..., 2:])
+        import cv2
+
+        until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12
+        camera, lens = _camera(self.width_px, self.height_px), np.append(parameters[N_PLANE:], (0.0, 0.0))
+        points = np.ascontiguousarray(picture_px, dtype=float).reshape(-1, 1, 2)
+        ideal_px = cv2.undistortImagePoints(points, camera, lens, None, until)
+        places_m = cv2.perspectiveTransform(ideal_px, _homography(parameters) @ np.linalg.inv(camera))
+        return np.asarray(places_m, dtype=float).reshape(picture_px.shape)
 
 
-def _half_diagonal_px(width_px: int, height_px: int) -> float:
-    """Half the picture's diagonal, px: the unit of undistorted coordinates."""
-    return 0.5 * float(np.hypot(width_px, height_px))
+def _camera(width_px: int, height_px: int) -> Floats:
+    """OpenCV's matrix of a camera whose undistorted coordinates are in half-diagonals from the picture's middle."""
+    unit_px = 0.5 * math.hypot(width_px, height_px)
+    return np.array([[unit_px, 0.0, (width_px - 1) / 2], [0.0, unit_px, (height_px - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def _homography(parameters: Floats) -> Floats:
+    return np.append(parameters[:N_PLANE], 1.0).reshape(3, 3)
 
 
 def fit_plane(corners_px: Floats, board_m: Floats, width_px: int, height_px: int) -> tuple[PlaneMap, float]:
@@ -342,56 +350,32 @@ def fit_plane(corners_px: Floats, board_m: Floats, width_px: int, height_px: int
     import cv2
     from scipy.optimize import least_squares
 
-    corners = _half_diagonals(corners_px, (width_px, height_px))
-    reach_m = float(np.ptp(board_m, axis=0).max())
-    places = board_m / reach_m
-    values = np.append(cv2.findHomography(corners, places)[0].ravel()[:8], np.zeros(N_LENS))
-    unit_px = _half_diagonal_px(width_px, height_px)
-    noise_px = 0.1
+    camera, still, reach_m = _camera(width_px, height_px), np.zeros(3), float(np.ptp(board_m, axis=0).max())
+    places = (board_m / reach_m)[:, None]
+    start, _ = cv2.findHomography(cv2.undistortPoints(corners_px[:, None], camera, None), places)
+    values, noise_px = np.append(start.ravel()[:N_PLANE], np.zeros(N_LENS)), 0.1
+
+    def off_px(values: Floats) -> Floats:
+        """Corners minus their predicted positions, shape (n, 2)."""
+        ideal = cv2.perspectiveTransform(places, np.linalg.inv(_homography(values)))
+        lens = np.append(values[N_PLANE:], (0.0, 0.0))
+        seen, _ = cv2.projectPoints(cv2.convertPointsToHomogeneous(ideal), still, still, camera, lens)
+        return np.asarray(corners_px - seen[:, 0])
 
     def misfit(values: Floats) -> Floats:
         """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
-        fit = _residuals(values, corners, places).ravel() / (noise_px / unit_px)
-        return np.concatenate([fit, values[6:] / np.array(PRIOR_SIGMA)])
+        return np.concatenate([off_px(values).ravel() / noise_px, values[6:] / np.array(PRIOR_SIGMA)])
 
     # 3: iterations of fit and noise estimate (chosen)
     for _ in range(3):
         fit = least_squares(misfit, values, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
-        squares_px = unit_px**2 * (_residuals(values, corners, places) ** 2).sum(axis=1)
+        squares_px = (off_px(values) ** 2).sum(axis=1)
         # 0.01: chosen: no corner is located better
-        noise_px = max(math.sqrt(squares_px.sum() / max(2 * len(corners) - N_PLANE - N_LENS, 1)), 0.01)
+        noise_px = max(math.sqrt(squares_px.sum() / max(2 * len(corners_px) - N_PLANE - N_LENS, 1)), 0.01)
     metres = np.array([reach_m] * 6 + [1.0] * 4)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * np.outer(metres, metres)
     return PlaneMap(width_px, height_px, values * metres, covariance), math.sqrt(squares_px.mean())
-
-
-def _half_diagonals(picture_px: Floats, size: tuple[int, int]) -> Floats:
-    middle = (np.array(size) - 1) / 2
-    return np.asarray((np.asarray(picture_px, dtype=float) - middle) / _half_diagonal_px(*size))
-
-
-def _undistorted(distorted: Floats, lens: Floats) -> Floats:
-    """Solve q(1 + κ₁q² + κ₂q⁴) = q_d by Newton's method; where a strong lens folds over, steps are limited."""
-    distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
-    radius = distorted_radius.copy()
-    # 12: iterations of Newton's method (chosen)
-    for _ in range(12):
-        excess = radius * (1 + lens[0] * radius**2 + lens[1] * radius**4) - distorted_radius
-        slope = 1 + 3 * lens[0] * radius**2 + 5 * lens[1] * radius**4
-        radius = radius - excess / np.maximum(slope, 0.2)
-    return np.asarray(
-        distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
-    )
-
-
-def _residuals(values: Floats, corners: Floats, board: Floats) -> Floats:
-    """Corners minus their predicted positions, half-diagonals, shape (n, 2)."""
-    homography = np.append(values[:N_PLANE], 1.0).reshape(3, 3)
-    projected = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
-    ideal = projected[:, :2] / projected[:, 2:]
-    radius2 = (ideal**2).sum(axis=-1, keepdims=True)
-    return np.asarray(corners - ideal * (1 + values[8] * radius2 + values[9] * radius2**2))
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
