@@ -6,7 +6,7 @@ import itertools
 import re
 import struct
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
@@ -199,44 +199,27 @@ def inspect_mraw(path: Path) -> Recording:
     if side is None or data is None:
         missing = ".mraw is missing, which holds" if side else ".cih or .cihx is missing, which describes"
         raise RecordingError(f"its {missing} the pictures", "put it in the same folder", path.name)
-    facts = read_side_file(side)
-    grey = not facts.colour or facts.colour.lower().startswith("mono")
-    if not (facts.file_format.lower() == "mraw" and grey and facts.stored_bits in (8, 12, 16)):
+    recording, file_format, colour = read_side_file(side)
+    raw, grey = recording.raw, not colour or colour.lower().startswith("mono")
+    assert raw is not None
+    if not (file_format.lower() == "mraw" and grey and raw.stored_bits in (8, 12, 16)):
         raise RecordingError(
-            f"{facts.file_format or 'unknown'} pictures of {facts.stored_bits} bits ({facts.colour}) are not read",
+            f"{file_format or 'unknown'} pictures of {raw.stored_bits} bits ({colour}) are not read",
             "save them as MRAW with 8, 12 or 16 bits of grey, or as AVI or TIFF",
             side.name,
         )
-    frames = RawFrames(data, (), facts.width, facts.height, facts.stored_bits)
-    if min(facts.width, facts.height, facts.n_frames) < 1 or (facts.width * facts.height * facts.stored_bits) % 8:
+    count = recording.declared_frames or 0
+    if min(raw.width, raw.height, count) < 1 or (raw.width * raw.height * raw.stored_bits) % 8:
         raise RecordingError("size or number of frames is missing", "copy it from the camera again", side.name)
-    present = min(facts.n_frames, file_size(data) // frames.frame_bytes)
-    frames = replace(frames, offsets=range(0, present * frames.frame_bytes, frames.frame_bytes))
-    depth = facts.depth if 0 < facts.depth <= facts.stored_bits else facts.stored_bits
-    return Recording(
-        data, "raw", facts.width, facts.height, depth, facts.n_frames, facts.rate, facts.exposure_s,
-        notes=facts.notes, raw=frames,
-    )  # fmt: skip
+    present = min(count, file_size(data) // raw.frame_bytes)
+    offsets = range(0, present * raw.frame_bytes, raw.frame_bytes)
+    return replace(recording, path=data, raw=replace(raw, file=data, offsets=offsets))
 
 
-@dataclass(frozen=True)
-class SideFile:
-    """Content of a Photron side file: `rate` in frames a second of capture and `exposure_s`, None where not stated."""
-
-    n_frames: int
-    width: int
-    height: int
-    stored_bits: int
-    depth: int
-    file_format: str
-    colour: str
-    rate: float | None
-    exposure_s: float | None
-    notes: tuple[str, ...] = ()
-
-
-def read_side_file(path: Path) -> SideFile:
-    """Read a Photron `.cih` or `.cihx`."""
+def read_side_file(path: Path) -> tuple[Recording, str, str]:
+    """Read a Photron `.cih` or `.cihx`: what it states of the recording, the format of its pictures and their colours.
+    `raw` has no frames yet.
+    """
     name = path.name
     try:
         file_size(path)  # refuses a pipe, on which reading would wait
@@ -268,14 +251,18 @@ def read_side_file(path: Path) -> SideFile:
         notes.append(f"{name}: every {step:g}th frame was saved: {rate:g} frames a second of {rate * step:g}")
     if not 0 < exposure_s * rate <= 1.0 + EXPOSURE_TOLERANCE:
         exposure_s = 0.0
-    return SideFile(
-        int(value("Total Frame")), int(value("Image Width")), int(value("Image Height")), int(value("Color Bit")),
-        int(value("EffectiveBit Depth")), values.get("File Format", ""), values.get("Color Type", ""),
-        rate if rate > 0 else None, exposure_s or None, tuple(notes),
+    width, height, bits, depth = (
+        int(value(key)) for key in ("Image Width", "Image Height", "Color Bit", "EffectiveBit Depth")
+    )
+    recording = Recording(
+        path, "raw", width, height, depth if 0 < depth <= bits else bits, int(value("Total Frame")),
+        rate if rate > 0 else None, exposure_s or None, notes=tuple(notes),
+        raw=RawFrames(path, (), width, height, bits),
     )  # fmt: skip
+    return recording, values.get("File Format", ""), values.get("Color Type", "")
 
 
-def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count: int) -> SideFile | None:
+def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count: int) -> Recording | None:
     """Find and read the side file of a TIFF stack or of a folder of pictures."""
     if pictures.is_dir():
         side_files = [at for at in sorted(pictures.iterdir()) if at.suffix.lower() in SIDE_FILES]
@@ -283,11 +270,11 @@ def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count:
         side_files = _siblings(pictures, SIDE_FILES)
     if len({at.stem for at in side_files}) != 1:
         return None
-    facts = read_side_file(side_files[0])
+    recording, stated, _ = read_side_file(side_files[0])
     formats = {"tif": "tiff", "jpg": "jpeg"}
-    stated = formats.get(facts.file_format.lower(), facts.file_format.lower())
-    same = (facts.width, facts.height) == size and facts.n_frames == count
-    return facts if same and stated == formats.get(file_format, file_format) else None
+    stated = formats.get(stated.lower(), stated.lower())
+    same = (recording.width, recording.height) == size and recording.declared_frames == count
+    return recording if same and stated == formats.get(file_format, file_format) else None
 
 
 def _siblings(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -340,7 +327,7 @@ def inspect_images(path: Path) -> Recording:
     height, width = readable.shape
     side = side_file_of(path, files[0].suffix.lower().removeprefix("."), (width, height), count)
     if side is not None and fps is None:
-        fps, exposure, depth, notes = side.rate, side.exposure_s, side.depth or depth, (*notes, *side.notes)
+        fps, exposure, depth, notes = side.capture_fps, side.exposure_s, side.bit_depth or depth, (*notes, *side.notes)
     kind = "stack" if is_stack else "folder"
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
