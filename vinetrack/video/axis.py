@@ -20,7 +20,7 @@ from vinetrack.core.records import Bools, Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX, SMALLEST_POINT_SPACING_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import collecting_path
-from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
+from vinetrack.video.small_pictures import Pixels, SmallPictures, changed_pixels, order_tolerance
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -258,16 +258,11 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
 
 
 def front_share(small: SmallPictures, axis: Axis) -> float:
-    """Share of the change along an axis that is one front passing once. Only pixels whose change lasts count
-    (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that change count.
-    """
+    """Share of the growth along an axis that is one front passing once; 0 where hardly any pixel grows there."""
     band = float(np.clip(0.6 * axis.width_px / small.factor, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
-    along = (along_axis(small, pixels, axis) for pixels in (small.changed, small.grown))
-    near, near_lasting = (pixels.where(np.abs(pixels.y) < band) for pixels in along)
-    if len(near.x) < 12:
-        raise RecordingError("nothing moves along the axis")
-    lasts = len(near_lasting.x) >= max(12, MIN_GROWN_PART * len(near.x))
-    return share_on_front(near_lasting if lasts else near, band)
+    along = along_axis(small, small.grown, axis)
+    near = along.where(np.abs(along.y) < band)
+    return share_on_front(near, band) if len(near.x) >= 12 else 0.0
 
 
 def along_axis(small: SmallPictures, pixels: Pixels, axis: Axis) -> Pixels:
