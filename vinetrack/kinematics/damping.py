@@ -222,19 +222,17 @@ def _fit(
         shift = np.concatenate([steep, steep_B[0]]) - estimate
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
     by_shared = 1.959964 * np.sqrt(np.sum(moved**2, axis=1))
-    low_total, high_total = (
-        estimate - np.hypot(estimate - low, by_shared),
-        estimate + np.hypot(high - estimate, by_shared),
-    )
+    total = estimate - np.hypot(estimate - low, by_shared), estimate + np.hypot(high - estimate, by_shared)
+    own_95, total_95 = np.column_stack([low, high]), np.column_stack(total)
     return {
         "n": n,
-        "n_95": [float(low[0]), float(high[0])],
-        "n_95_total": [float(low_total[0]), float(high_total[0])],
+        "n_95": own_95[0].tolist(),
+        "n_95_total": total_95[0].tolist(),
         "vines": {
             name: {
                 "B": float(np.exp(log_B[i])),
-                "B_95": [float(np.exp(low[i + 1])), float(np.exp(high[i + 1]))],
-                "B_95_total": [float(np.exp(low_total[i + 1])), float(np.exp(high_total[i + 1]))],
+                "B_95": np.exp(own_95[i + 1]).tolist(),
+                "B_95_total": np.exp(total_95[i + 1]).tolist(),
                 "R2": _r_squared(data.log_force[data.vine == i], residual[data.vine == i]),
                 "diameter_mm": float(vines["diameter_mm"][name]),
                 "thickness_um": float(vines["thickness_um"][name]),
@@ -350,16 +348,18 @@ def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> l
     (other,) = within
     ordered = table.dropna(subset=[along, other]).sort_values(other, kind="stable")
     return [
-        {
-            "along": along,
-            "vines": group["vine"].tolist(),
-            "sizes": group[along].tolist(),
-            "B": group["B"].tolist(),
-            "B_95_total": group["B_95_total"].tolist(),
-            **_lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group)),
-        }
+        {"along": along, "sizes": group[along].tolist(), **_values(group, (), ("vine", "B", "B_95_total"))}
+        | _lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group))
         for group in _of_several_sizes(ordered, within, [along])
     ]
+
+
+def _values(group: pd.DataFrame, shared: Iterable[str], each: Iterable[str]) -> dict[str, Any]:
+    """Columns of a family: values that all rows share, and those of each row."""
+    plural = {"vine": "vines", "condition": "conditions"}
+    return {name: float(group[name].iloc[0]) for name in shared} | {
+        plural.get(name, name): group[name].tolist() for name in each
+    }
 
 
 def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
@@ -423,25 +423,19 @@ def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "pressure_kPa": SAME_SETTING_WITHIN,
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
-    columns = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
+    speeds = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
     families = []
     for group in _of_several_sizes(bare, settings, ["diameter_mm"]):
-        sizes, speeds, relative = (
+        sizes, speed, relative = (
             group[name].to_numpy(float) for name in ("diameter_mm", "x_ss_m_s", "x_ss_over_diameter_1_s")
         )
+        count = np.unique(sizes).size
         families.append(
-            {
-                "along": "diameter_mm",
-                "pressure_kPa": float(group["pressure_kPa"].iloc[0]),
-                "wall_over_diameter": float(group["wall_over_diameter"].mean()),
-                "conditions": group["condition"].tolist(),
-                "vines": group["vine"].tolist(),
-                "sizes": sizes.tolist(),
-                **{name: group[name].tolist() for name in columns},
-                "monotonic": bool(np.all(np.diff(speeds) > 0)),
-                **_lines(sizes, speeds, np.unique(sizes).size),
-                "over_diameter": _lines(sizes, relative, np.unique(sizes).size),
-            }
+            {"along": "diameter_mm", "sizes": sizes.tolist(), "monotonic": bool(np.all(np.diff(speed) > 0))}
+            | _values(group, ("pressure_kPa",), ("condition", "vine", *speeds))
+            | {"wall_over_diameter": float(group["wall_over_diameter"].mean())}
+            | _lines(sizes, speed, count)
+            | {"over_diameter": _lines(sizes, relative, count)}
         )
     return families
 
@@ -462,21 +456,14 @@ def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
     efficiencies = ("efficiency", "efficiency_payload", "efficiency_with_weight")
-    fixed = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
-    each = ("diameter_mm", "thickness_um", "n_efficiency", "weight_share")
-    values = [name for key in efficiencies for name in (key, f"{key}_sigma")]
+    shared = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
+    each = ("condition", "vine", "diameter_mm", "thickness_um", "n_efficiency", "weight_share")
+    errors = [name for key in efficiencies for name in (key, f"{key}_sigma")]
     families = []
     for group in _of_several_sizes(known, settings, ["diameter_mm", "thickness_um"]):
         sizes = {name: group[name].to_numpy(float) for name in ("thickness_um", "diameter_mm")}
-        families.append(
-            {
-                **{name: float(group[name].iloc[0]) for name in fixed},
-                "conditions": group["condition"].tolist(),
-                "vines": group["vine"].tolist(),
-                **{name: group[name].tolist() for name in (*each, *values)},
-                "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in efficiencies},
-            }
-        )
+        trend = {key: planes(sizes, group[key].to_numpy(float)) for key in efficiencies}
+        families.append({**_values(group, shared, (*each, *errors)), "trend": trend})
     return families
 
 
