@@ -1,8 +1,7 @@
 """Shrunk frames of a recording and the time at which each pixel changes: input of the search for the axis.
 
-Not every change is growth. A door, a hand or a payload passes over many pixels, and a door leaves the place where it
-stood at first. What an everting tube covers stays covered, and differs from its surroundings in the last pictures but
-not in the first: `SmallPictures.grown` selects the pixels that change in this way.
+Not every change is growth. A door, a hand or a payload passes over many pixels. What an everting tube covers stays
+covered: `SmallPictures.grown` selects the pixels that change once and for good.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from vinetrack.video.frames import (
 from vinetrack.video.kymograph import largest_steps
 
 MAX_FRAMES = 150  # Maximum number of frames in which the axis is sought, spread evenly over the changes (chosen)
-MIN_GROWN_PART = 0.16  # Part of all change that must be growth (chosen)
+MIN_GROWN_PART = 0.18  # Part of all change that must be growth (measured)
 
 
 class Pixels(NamedTuple):
@@ -79,17 +78,15 @@ class SmallPictures:
 
     @cached_property
     def grown(self) -> Pixels:
-        """Pixels that change as in growth: the change lasts, and stands out where nothing did before. Their weight is
-        reduced where many change at the same time, as where a door comes to rest. If hardly any change lasts
-        (MIN_GROWN_PART), this is `changed`.
+        """Pixels that change as in growth, by a step that lasts. Their weight is reduced where many change at once, as
+        where a door comes to rest. If too little of all change lasts (MIN_GROWN_PART), this is `changed`.
         """
         if not len(self.changed.x):
             return self.changed
         frames, noise = _busy_frames(self.frames)
         rows, columns = self.changed.y.astype(int), self.changed.x.astype(int)
         lasting = _step_fraction(frames[:, rows, columns].astype(float), self.changed.time.astype(int), noise)
-        # 0.4: score of growth (measured)
-        kept = self.changed.where(lasting * _contrast_gain(frames, rows, columns, noise) > 0.4)
+        kept = self.changed.where(lasting > 0.8)  # 0.8: part of a pixel's change that the step explains (measured)
         if kept.weight.sum() < MIN_GROWN_PART * self.changed.weight.sum():
             return self.changed
         # The information of a pixel changing just when a front passes it, in nats, is minus the logarithm of the part
@@ -144,42 +141,6 @@ def _step_fraction(values: Floats, frame: Indices, noise_power: float) -> Floats
     explained = frame * (n - frame) / n * step**2
     unexplained = np.maximum(n * values.var(axis=0) - explained - n * noise_power, 0.0)
     return explained / np.maximum(explained + unexplained, 1e-9)
-
-
-def _contrast_gain(frames: NDArray[np.float32], rows: Indices, columns: Indices, noise_power: float) -> Floats:
-    """How much more changed pixels differ from their surroundings at the end than at the beginning, shape (n_pixels,).
-    1 if they did not differ at first, 0 if they do not differ at the end.
-    """
-    import cv2
-
-    # 12: one in so many pictures at either end are averaged (chosen)
-    count = max(2, len(frames) // 12)
-    ends = [np.median(frames[:count], axis=0), np.median(frames[-count:], axis=0)]
-    still = np.ones(frames.shape[1:], np.float32)
-    still[rows, columns] = 0.0
-    out = np.zeros(len(rows))
-    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # sides of a pixel
-        first, last, weight = (_side_sum(picture * still, down, across) for picture in (*ends, np.ones_like(still)))
-        before, after = (
-            cv2.blur((picture - ground / np.maximum(weight, 1e-9)) ** 2, (3, 3))[rows, columns]
-            for picture, ground in zip(ends, (first, last), strict=True)
-        )
-        seen = weight[rows, columns] > 1e-6
-        out = np.maximum(out, np.where(seen, after / (before + after + 2 * noise_power), 0.0))
-    return out
-
-
-def _side_sum(picture: NDArray[np.float32], down: int, across: int) -> NDArray[np.float32]:
-    """Mean of the pixels on one side of each pixel; distant ones count where none is near."""
-    import cv2
-
-    out = np.zeros_like(picture)
-    # 6, 24, 96: distances, in the small pictures, over which unchanged pixels are the surroundings of a pixel (chosen)
-    for share, reach in ((1.0, 6), (1e-2, 24), (1e-4, 96)):
-        size = (reach + 1 if across else 2 * reach + 1), (reach + 1 if down else 2 * reach + 1)
-        anchor = (reach if across <= 0 else 0), (reach if down <= 0 else 0)
-        out += share * cv2.boxFilter(picture, -1, size, anchor=anchor, borderType=cv2.BORDER_CONSTANT)
-    return out
 
 
 def order_tolerance(n_times: int) -> float:
