@@ -216,12 +216,11 @@ def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
     """Find the growth axis from the motion."""
     if len(small.frames) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
-    best = _line_through_pairs(small, small.grown, small.grown.weight) if grows else _NO_LINE
-    if best.collected <= 0:
-        best = _line_through_pairs(small, small.changed, small.changed.weight)
-    if best.front_share < LEAST_FRONT_SHARE:
-        # The vine meets a wall, bends or sweeps: the axis is that of the longest orderly beginning.
-        best = _line_of_beginning(small, best, grows)
+    pixels = small.grown if grows else small.changed
+    best = _line_through_pairs(small, pixels, pixels.weight)
+    if best.front_share < LEAST_FRONT_SHARE and pixels is small.changed:
+        # Hardly any change lasts, as of a vine that sweeps: the axis is that of the longest orderly beginning.
+        best = _line_of_beginning(small, best)
     if best.collected <= 0 and len(small.changed.x) < 12:
         raise RecordingError("nothing moves in the picture")
     if best.collected <= 0:
@@ -237,24 +236,16 @@ def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
     return axis_through([centre + low * along, centre + high * along], 2 * best.half * factor)
 
 
-def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line:
+def _line_of_beginning(small: SmallPictures, whole: _Line) -> _Line:
     """The line of the beginning of a recording that collects most change in order; else that of the whole."""
-    best = whole
-    use_lasting = grows and small.grown is not small.changed
+    orderly = []
     # Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
     for fraction in (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
-        if use_lasting:  # those that change within this fraction
-            pixels = small.grown.where(small.grown.time < fraction * small.grown.n_times)
-        else:
-            pixels = changed_pixels(small.frames[: max(3, int(fraction * len(small.frames)))])
+        pixels = changed_pixels(small.frames[: max(3, int(fraction * len(small.frames)))])
         # Of a vine that bends and sweeps, early change counts most; elsewhere a door, which swings first, would too.
         line = _line_through_pairs(small, pixels, pixels.weight * (1 - 0.8 * pixels.time / pixels.n_times))
-        in_order = line.front_share * line.collected
-        if line.front_share >= LEAST_FRONT_SHARE and (
-            best.front_share < LEAST_FRONT_SHARE or in_order > best.front_share * best.collected
-        ):
-            best = line
-    return best
+        orderly += [line] if line.front_share >= LEAST_FRONT_SHARE else []
+    return max(orderly, key=lambda line: line.front_share * line.collected, default=whole)
 
 
 def front_share(small: SmallPictures, axis: Axis) -> float:
