@@ -328,7 +328,18 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
     """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
     `down` is the growth angle from straight down as the sheet states it: no picture shows it.
     """
-    rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
+    rows = []
+    for fact, trial in zip(facts, trials, strict=True):
+        ends = () if fact.axis is None else (*fact.axis.from_px, *fact.axis.to_px)
+        axis = "{},{} → {},{}".format(*(round(end) for end in ends)) if ends else "–"
+        frames, plays = fact.n_frames, fact.playback_fps
+        cells = (
+            fact.trial, "–" if frames is None else str(frames), f"{fact.capture_fps:g}",
+            "–" if plays is None else f"{plays:.4g}", number(fact.duration_s), number(fact.mm_per_px, 4),
+            number(fact.picture_mm), axis, f"{math.degrees(trial.growth_angle_rad):g}", number(fact.tube_width_mm),
+            number(1e3 * trial.diameter_m), number(fact.growth_mm), number(1e3 * trial.length_m),
+        )  # fmt: skip
+        rows.append(cells)
     head = ("recording", "frames", "rate", "plays", "lasts", "scale", "picture", "axis", "down",
             "tube", "sheet", "growth", "sheet")  # fmt: skip
     units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "°", "mm", "mm", "mm", "mm")
@@ -339,19 +350,6 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
     """Convert the facts of a recording to a JSON mapping; units are in the keys."""
     axis = None if facts.axis is None else axis_entry(facts.axis)
     return vars(facts) | {"duration_s": facts.duration_s, "axis": axis}
-
-
-def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
-    """Cells of one recording's row."""
-    ends = () if facts.axis is None else (*facts.axis.from_px, *facts.axis.to_px)
-    axis = "{},{} → {},{}".format(*(round(end) for end in ends)) if ends else "–"
-    frames, plays = facts.n_frames, facts.playback_fps
-    return (
-        facts.trial, "–" if frames is None else str(frames), f"{facts.capture_fps:g}",
-        "–" if plays is None else f"{plays:.4g}", number(facts.duration_s), number(facts.mm_per_px, 4),
-        number(facts.picture_mm), axis, f"{math.degrees(trial.growth_angle_rad):g}", number(facts.tube_width_mm),
-        number(1e3 * trial.diameter_m), number(facts.growth_mm), number(1e3 * trial.length_m),
-    )  # fmt: skip
 
 
 SETTINGS = "experiment.yaml"
