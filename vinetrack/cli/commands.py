@@ -135,7 +135,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
         diagnosis = diagnosed(source, results, pairs, report)
         if json is None:
             write_diagnosis(results, diagnosis, pairs, run_settings(read_json(results.provenance)["settings"]))
-        return [str(diagnosis)], diagnosis.to_json()
+        return [str(diagnosis).replace("RESULTS", str(target))], diagnosis.to_json()
     read = read_experiment(find_experiment(target))
     if read.trials and all(trial.track is None for trial in read.trials):
         raise UserError(

@@ -361,6 +361,7 @@ class Diagnosis(Printed, Drawn, JsonRecord):
     refused: str = ""
     power: StoredPower | None = None
     odd_trials: tuple[str, ...] = ()
+    results: Annotated[str, Field(exclude=True)] = "RESULTS"  # its folder, as a command takes it
 
     @property
     def verdict(self) -> str:

@@ -129,7 +129,21 @@ class Search:
             if (of_base, name) not in self.tried:
                 self.tried.add((of_base, name))
                 self._fit_from_prediction(tests, effects, name)
+        if every and all(is_poor_fit(known.fit.predictor, known.fit.solution) for known in self.of_size(1)):
+            self._fit_from_slips()
         return self.of_size(len(effects) + 1)
+
+    def _fit_from_slips(self) -> None:
+        """Fit effects from the sizes of slips in the sheet, held until all else has adapted: no prediction reaches as
+        far as a wrong power of ten.
+        """
+        fixed = self.before.options["fixed"]
+        slips = [(one, size) for one in self.tests.effects for p in one.parameters[:1] for size, _ in p.slips]
+        for effect, slip in slips:
+            key = f"{effect.name}.{effect.parameters[0].name}"
+            held = full_fit(self.before, self.before.model + effect, start={key: slip}, fixed=(*fixed, key))
+            if held is not None and held.log_likelihood > self.before.log_likelihood:
+                self._keep_best(likelihood_ratio(self.before, (effect,), full_fit(held, fixed=fixed) or held))
 
     def _fit_from_prediction(self, tests: MisfitTests, effects: Sequence[Effect], name: str) -> None:
         """Add an effect in its shapes of largest predicted gain, until one gains what is predicted."""
@@ -180,15 +194,11 @@ class Search:
         """
         names = frozenset(effect.name for effect in effects)
         if again or names not in self.fitted:
-            self._refit(hypothesis.fit, effects)
+            with suppress(FitError, SimulationError, np.linalg.LinAlgError):
+                after = refit(hypothesis.fit, reduce(Model.__add__, effects, self.before.model))
+                self._keep_best(likelihood_ratio(self.before, effects, after))
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
-
-    def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
-        """Keep a set that is fitted from another one, unless no fit succeeds."""
-        with suppress(FitError, SimulationError, np.linalg.LinAlgError):
-            after = refit(fit, reduce(Model.__add__, effects, self.before.model))
-            self._keep_best(likelihood_ratio(self.before, effects, after))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low, or not known."""

@@ -168,7 +168,7 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else f" Known are {', '.join(known)}."
+    hint = f" Did you mean {near[0]!r}?" if near else " `vinetrack effects` lists them all."
     raise EffectError(f"There is no effect named {name!r}.{hint}")
 
 

@@ -22,11 +22,16 @@ PARAMETERS = (
         "ε",
         "1",
         0.02,
-        bounds=(-0.6, 1.5),
+        bounds=(-0.95, 19.0),
         shared="day",
         plausible=(-0.1, 0.1),
         meaning="relative error of time",
-        slips=((1.0, "half the frame rate was stated"), (-0.5, "twice the frame rate was stated")),
+        slips=(
+            (1.0, "half the frame rate was stated"),
+            (-0.5, "twice the frame rate was stated"),
+            (9.0, "a tenth of the frame rate was stated"),
+            (-0.9, "ten times the frame rate was stated"),
+        ),
     ),
 )
 

@@ -108,7 +108,10 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     problems: list[Problem] = []
     settings, table = None, None
     try:
-        settings = _read_settings(folder, problems)
+        settings = read_experiment_settings(folder / SETTINGS, problems)
+        for name in SHARED:
+            if said := COLUMNS[name].unusual(value := getattr(settings, name)):
+                problems.append(Problem("unusual", said, name, file=SETTINGS, value=f"{value:g}", severity="warning"))
     except ExperimentError as error:
         problems += error.problems
     try:
@@ -136,6 +139,10 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.faulty for row in in_use)):
         raise ExperimentError(problems)
+    # The everting vines for which a column that may be blank or unknown is.
+    open_columns = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
+    vines = [row for row in in_use if row.travel_ratio == 2]
+    blank = {column: tuple(row.name for row in vines if column not in row.values) for column in open_columns}
     trials = [make_trial(row, folder, settings) for row in in_use if not row.faulty]
     trials = [replace(trial, corrections=corrections.get(trial.name, ())) if trial.video else trial for trial in trials]
     reasons = {row.name: "; ".join(p.reason for p in row.problems if p.severity == "error") for row in in_use}
@@ -148,26 +155,10 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
-        blank={column: names for column in COLUMNS if (names := _without(column, in_use))},
+        blank={column: names for column, names in blank.items() if names},
         columns=table.columns if table else (),
         recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
-
-
-def _without(column: str, rows: Sequence[Row]) -> tuple[str, ...]:
-    """The everting vines for which a column that may be blank or unknown is."""
-    can_be = COLUMNS[column].if_blank or COLUMNS[column].default == "unknown"
-    return tuple(row.name for row in rows if can_be and column not in row.values and row.travel_ratio == 2)
-
-
-def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings:
-    """Read the settings and check their values."""
-    settings = read_experiment_settings(folder / SETTINGS, problems)
-    for name in SHARED:
-        value = getattr(settings, name)
-        if said := COLUMNS[name].unusual(value):
-            problems.append(Problem("unusual", said, name, file=SETTINGS, value=f"{value:g}", severity="warning"))
-    return settings
 
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:

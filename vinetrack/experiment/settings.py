@@ -328,6 +328,9 @@ def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) 
     """Read `experiment.yaml`, and add to `warnings` what is converted; return the defaults if there is no such file."""
     # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
+        if other := next(path.parent.glob("[eE]xperiment.[yY]*"), None):
+            remedy = f"rename it to {path.name}"
+            raise ExperimentError([Problem("misnamed", "is not read under this name", file=other.name, remedy=remedy)])
         return ExperimentSettings()
     document = read_yaml(path)
     _to_key_units(document, path.name, [] if warnings is None else warnings)

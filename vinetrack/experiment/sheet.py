@@ -17,7 +17,7 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, read_table, safe_join
-from vinetrack.core.units import pressure_text
+from vinetrack.core.units import UNITS, convert, pressure_text
 from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
@@ -154,7 +154,10 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         try:
             if text := cells.get(name, ""):
                 row.values[name] = column.read(text, table.decimal)
-                if said := column.unusual(row.values[name]):
+                if said := column.unusual(value := row.values[name]):
+                    if typed := table.units.get(name):
+                        was = f"{convert(value, column.unit_key, typed):.6g} {UNITS[typed].text}"
+                        said = f"is unusual: {was} was typed: is the unit in the name of its column right?"
                     row.add("unusual", said, name, "warning", value=text)
             elif name in SHARED and (shared := getattr(settings, name)) is not None:
                 row.values[name] = shared

@@ -422,6 +422,8 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     >>> fit.table()["unit"].tolist()
     ['N·(s/m)ⁿ', '1', 'Pa']
     """
+    if not isinstance(model, Model):
+        raise FitError(f"{model!r} is no model: give vt.base_model() or vt.make_model(names of effects).")
     pairs, _, left_out = read_source(source, options.pop("tracks", None))
     fitted = fit_pairs(model, pairs, **options)
     return replace(fitted, left_out={**left_out, **fitted.left_out})

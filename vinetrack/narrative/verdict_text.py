@@ -302,16 +302,17 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         if diagnosis.not_tried:
             return f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}: not tried so far", ""
         table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
+        then = f"run `vinetrack propose {diagnosis.results}`"
         if table is not None and (near := list(table["added"][table["partial"]])):
-            return f"see what `vinetrack add {near[0]} RESULTS`, a part, leaves; then run `vinetrack propose`", told
-        return "look at the figures of the missing force, and run `vinetrack propose`", told
+            return f"see what `vinetrack add {near[0]} {diagnosis.results}`, a part, leaves; then {then}", told
+        return f"look at the figures of the missing force, and {then}", told
     if diagnosis.next_experiment:
         return str(diagnosis.next_experiment.get("text", "")), ""
     if last == ARTEFACT:
         names = diagnosis.rounds[-1].answer_set
         return "correct the measurement, and run again", _remedies(names)
     if verdict == MISSING:
-        saved = f"`vinetrack add {'+'.join(diagnosis.effects)} RESULTS --save`"
+        saved = f"`vinetrack add {'+'.join(diagnosis.effects)} {diagnosis.results} --save`"
         return f"keep it with {saved}, and measure its size by other means", _remedies(diagnosis.effects)
     if verdict == AMBIGUOUS:
         return "measure what tells them apart", _remedies(diagnosis.answer_set)

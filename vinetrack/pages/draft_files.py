@@ -136,6 +136,7 @@ def read_settings_text(folder: Path) -> str:
     """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill."""
     path = folder / SETTINGS
     if not path.exists():
+        read_experiment_settings(path)  # refuses one under another name
         return first_settings()
     read_yaml(path)  # refuses what cannot be edited
     return read_text(path)
@@ -333,8 +334,8 @@ def place_block(
     named = (i for i, line in enumerate(lines) if any(f"_{name}_" in f"_{_plain(line)}_" for name in row_named))
     table = next(named, 0)
     known = [sum(bool(column_named(word)) for word in re.split(r"[\s,;|]+", line)) for line in lines[:table]]
-    # A header has at least two known words: a sentence may have one, such as psi.
-    table = table - 1 - known[::-1].index(max(known)) if max(known, default=0) > 1 else table
+    # A header is the last line with two known words at least: a sentence above it may have more.
+    table = max((i for i, count in enumerate(known) if count > 1), default=table)
     if table:
         notes.append(f"Left out, above the table: {' / '.join(lines[:table])}")
     block = read_block("\n".join(lines[table:]))

@@ -123,13 +123,6 @@ def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
 
 
-def fit_progress(task: str, step: Step | None, since_s: float) -> str:
-    """Return a progress bar of a fit whose number of steps is unknown, as HTML."""
-    done = 0 if step is None else step.iteration
-    # 5: steps after which the bar is half full (chosen)
-    return progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
-
-
 # ------------------------------------------------------------------------------
 # The controls: the trials shown, and the effects in the model with their sizes.
 
@@ -521,7 +514,9 @@ class Page:
             # A fit starts from that of the model in use.
             waits = background.running
             task, step = ("fitting the model in use first", background.step) if waits else ("refitting", self._step)
-            text = fit_progress(task, step, time.monotonic() - self._begun_s)
+            done, since_s = 0 if step is None else step.iteration, time.monotonic() - self._begun_s
+            # 5: steps after which the bar is half full; how many there will be is not known (chosen)
+            text = progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
         elif failure := self._message or background.failure:
             text = f'<span class="bad">{escape(failure)}</span>'
         elif background.running:

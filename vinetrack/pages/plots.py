@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -114,7 +115,8 @@ def templates() -> Environment:
 
 def panel(name: str, **given: Any) -> str:
     """Return a piece of HTML that `panels.html` makes of what is given."""
-    return str(getattr(templates().get_template("panels.html").module, name)(**given))
+    made = str(getattr(templates().get_template("panels.html").module, name)(**given))
+    return re.sub("`([^`<]+)`", r"<code>\1</code>", made)
 
 
 def progress_bar(share: float, text: str) -> str:

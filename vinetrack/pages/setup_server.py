@@ -203,9 +203,8 @@ def _marks_along(grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], rat
         level = levels.sum(axis=0)
         near = slice(int(0.95 * rate * u.size), int(1.05 * rate * u.size) + 2)
         rate = (near.start + int(np.argmax(np.abs(np.fft.rfft(level)[near])))) / u.size
-        # What is strongest may be a multiple of the marks' own rate.
-        strength = {n: abs(np.exp(-2j * np.pi * rate / n * u) @ level) for n in (3, 2, 1)}
-        rate /= next(n for n in strength if strength[n] >= 0.3 * strength[1])
+        # What is strongest across rows may be a multiple of the marks' own rate, which is stronger still along them.
+        rate /= max((1, 2, 3), key=lambda n: float(abs(np.exp(-2j * np.pi * rate / n * u) @ level)))
         if u.size * rate < FEWEST_SPACINGS:
             return None
         window = np.hanning(round(4 / rate) | 1)

@@ -271,8 +271,9 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on sizes and positions, so it is tested only if these have no errors.
     if not any(problem.severity == "error" or problem.code == "longer_than_the_vine" for problem in problems):
-        stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
-        problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
+        for problem in pressure_problems(speeds):
+            column = "pressure_kPa" if problem.column.startswith("pressure") else problem.column
+            problems.append(replace(problem, file=SHEET if column in experiment.columns else SETTINGS))
     lines = facts_rows(entries, list(surveyor.facts)) if entries else []
     if 0 < len(surveyor.looked_into) < len(entries):
         lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")

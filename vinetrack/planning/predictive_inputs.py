@@ -19,7 +19,7 @@ import numpy as np
 
 from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import convert, number
+from vinetrack.core.units import GRAVITY_M_S2, convert, number
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find_effect
 from vinetrack.experiment.schema import with_names
@@ -575,23 +575,22 @@ def predictive_inputs(
 
 
 # ------------------------------------------------------------------------------
-# Check of stated pressures against measured speeds, for errors of unit.
+# Check of stated pressures and rates against measured speeds, for errors of unit.
 #
 # The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the
-# scaling prior. A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even more.
+# scaling prior. A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even more. A rate ten times too
+# high makes the energy of motion a hundred times too large, more than gas and weight give in the whole growth.
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     """A warning if the speeds contradict the pressures as stated but agree with them in another unit: psi, kPa where
-    psi are stated, or absolute instead of gauge pressure.
+    psi are stated, or absolute instead of gauge pressure; else if they contradict the conservation of energy.
     """
     # Factors between implied and prior damping from which, and within which, another unit explains the speeds (chosen)
     far_off, near = 4.0, 2.5
     pairs = [(trial, speed) for trial, speed in speeds if trial.travel_ratio == 2 and trial.pressure_trace is None]
     as_stated = _middle_ratio(pairs)
-    if not (as_stated < 1 / far_off or as_stated > far_off):
-        return []
-    psi, stated = convert(1.0, "psi", "kPa"), pairs[0][0].pressure_unit
+    psi, stated = convert(1.0, "psi", "kPa"), pairs[0][0].pressure_unit if pairs else "kPa"
     factor, right, wrong = (psi, "psi", "kPa") if as_stated < 1 else (1 / psi, "kPa", "psi")
     how_much = f"(1 psi is {psi:.4g} kPa)"
     other_unit = f"{right}, not {wrong} {how_much}", "in the other unit", f"name the column pressure_{right}"
@@ -600,16 +599,27 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs if stated == wrong]
     with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
     gauge = gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else []
+    place: dict[str, Any] = {"file": "trials.csv", "severity": "warning"}
     for meant, (what, how, remedy) in ((gauge, absolute), (converted, other_unit), (with_yield, other_unit)):
         ratio = _middle_ratio(meant)
-        if 1 / near < ratio < near:
+        if not 1 / far_off < as_stated < far_off and 1 / near < ratio < near:
             message = (
                 f"looks like {what}: the measured speeds imply {number(as_stated, 2)} times the damping of tubes of "
                 f"this size, and {number(ratio, 2)} times {how}"
             )
-            place: dict[str, Any] = {"file": "trials.csv", "column": f"pressure_{stated}", "severity": "warning"}
-            return [Problem(message=message, remedy=remedy, **place)]
-    return []
+            return [Problem(message=message, column=f"pressure_{stated}", remedy=remedy, **place)]
+    too_fast = sorted(share for trial, speed in pairs if (share := _energy_share(trial, speed)) > 1)
+    if len(too_fast) < min(2, len(pairs)) or not pairs:
+        return []
+    message = f"is too high: a vine would move with {number(too_fast[-1], 2)} times the energy that it gets"
+    return [Problem("energy", message, "capture_fps", remedy="write the rate of capture, and check the scale", **place)]
+
+
+def _energy_share(trial: Trial, speed: float) -> float:
+    """Kinetic energy halfway at a mean speed, over the work of gas and weight in the whole growth."""
+    mass_kg, length_m = float(trial.moving_mass_kg(trial.length_m / 2)), trial.length_m
+    work_J = (trial.pressure_Pa * trial.area_m2 + trial.travel_ratio * mass_kg * GRAVITY_M_S2) * length_m
+    return 0.5 * mass_kg * (trial.travel_ratio * speed) ** 2 / work_J
 
 
 def _middle_ratio(pairs: Iterable[tuple[Trial, float]]) -> float:

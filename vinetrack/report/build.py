@@ -546,4 +546,5 @@ def build_report(content: dict[str, Any]) -> str:
     # Each style of the figures stands once in the page, as a class.
     styles: dict[str, str] = {}
     page = re.sub(r' style="([^"-][^"]*)"', lambda m: f' class="{styles.setdefault(m[1], f"f{len(styles)}")}"', page)
+    page = re.sub("`([^`<]+)`", r"<code>\1</code>", page)
     return page.replace("</style>", "".join(f".{k} {{{style}}}" for style, k in styles.items()) + "</style>", 1)

@@ -6,7 +6,9 @@ Names of trials are always text: `007` stays `007`, and a trial may be called `N
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -190,7 +192,9 @@ def read_diagnosis(results: Results) -> Diagnosis | None:
         return None
     ladder = read_result(results.ladder) if results.ladder.exists() else None
     with _reading(results.diagnosis):
-        return Diagnosis.from_json(read_json(results.diagnosis), None if ladder is None or ladder.empty else ladder)
+        named = shlex.quote(min(str(results.folder), os.path.relpath(results.folder), key=len))
+        content = read_json(results.diagnosis) | {"results": named}
+        return Diagnosis.from_json(content, None if ladder is None or ladder.empty else ladder)
 
 
 # ------------------------------------------------------------------------------

@@ -314,7 +314,7 @@ async function findTarget() {
   $("target").replaceChildren(el("span", {class: "busy"}, "looking …"));
   try {
     const found = await ask(url("api/target", {picture}));
-    $("target").textContent = found ? "" : `No row of marks and no printed board found in ${picture}: click two marks.`;
+    $("target").textContent = found ? "" : `No row of marks, 3 px apart or more, and no printed board found in ${picture}: click two marks.`;
     if (!found) return;
     document.querySelector(`input[name=scale][value=${found.squares ? "board" : "two_points"}]`).checked = true;
     if (found.squares) board = found;
