@@ -238,6 +238,17 @@ def test_a_slip_in_a_column_is_named(tmp_path, column, factor, named, size):
     assert row.plausible
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [10.0, 0.1])
+def test_a_rate_wrong_by_ten_in_all_rows_is_named(tmp_path, times):
+    """From where no linear prediction reaches: it was `unexplained`."""
+    pairs, _ = pairs_of(laboratory(tmp_path, "clean", 909, (10, 14))[1])
+    said = diagnosed([(trial, replace(track, time_s=times * track.time_s)) for trial, track in pairs])
+    assert (said.verdict, said.answer_set) == ("artefact", ("time_base",))
+    assert len(said.rounds[0].slips) == 1
+    assert all((1 + number.value) / times == pytest.approx(1, abs=0.02) for number in row_of(said, "time_base").numbers)
+
+
 def test_what_is_left_beside_a_slip_must_be_an_ordinary_error_and_that_is_no_slip():
     most = misfit_tests.RANGE_SHARE_BESIDE_SLIP * DIAMETER.plausible[1]
     inside, outside = ((1 + part * most) * (1 + FLAT) - 1 for part in (0.9, 1.2))

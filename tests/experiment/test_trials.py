@@ -220,7 +220,7 @@ def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
 
 
 def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path):
-    assert "diameter_mm '635' is above 300 mm" in one(tmp_path, diameter_mm=None, diameter_in="25").failed["a"]
+    assert "diameter_mm '25 in' is above 300 mm" in one(tmp_path, diameter_mm=None, diameter_in="25").failed["a"]
     read = one(tmp_path, diameter_in="2")
     assert read.trials[0].diameter_m == 24 / 1000
     assert ("twice", "diameter_in") in [(problem.code, problem.column) for problem in read.problems]

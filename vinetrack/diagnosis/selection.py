@@ -119,6 +119,8 @@ class Search:
         this size.
         """
         tests, effects = (self.tests_after(base.fit), base.effects) if base else (self.tests, ())
+        if not self.tried and is_poor_fit(self.before.predictor, self.before.solution):
+            self._fit_from_afar()
         gains = {name: tests.predicted_gain(name) for name in dict.fromkeys(tests.products.effects)}
         # By significance: of several sizes, or sizes that scatter, chance gains more.
         names, of_base = sorted(gains, key=lambda name: -tests.best_z(name)), frozenset(one.name for one in effects)
@@ -129,19 +131,14 @@ class Search:
             if (of_base, name) not in self.tried:
                 self.tried.add((of_base, name))
                 self._fit_from_prediction(tests, effects, name)
-        if every and all(is_poor_fit(known.fit.predictor, known.fit.solution) for known in self.of_size(1)):
-            self._fit_from_slips()
         return self.of_size(len(effects) + 1)
 
-    def _fit_from_slips(self) -> None:
-        """Fit effects from the sizes of slips in the sheet, held until all else has adapted: no prediction reaches as
-        far as a wrong power of ten.
-        """
+    def _fit_from_afar(self) -> None:
+        """Fit effects from sizes that no prediction reaches, a wrong power of ten, held until all else has adapted."""
         fixed = self.before.options["fixed"]
-        slips = [(one, size) for one in self.tests.effects for p in one.parameters[:1] for size, _ in p.slips]
-        for effect, slip in slips:
+        for effect, size in [(one, size) for one in self.tests.effects for p in one.parameters[:1] for size in p.tried]:
             key = f"{effect.name}.{effect.parameters[0].name}"
-            held = full_fit(self.before, self.before.model + effect, start={key: slip}, fixed=(*fixed, key))
+            held = full_fit(self.before, self.before.model + effect, start={key: size}, fixed=(*fixed, key))
             if held is not None and held.log_likelihood > self.before.log_likelihood:
                 self._keep_best(likelihood_ratio(self.before, (effect,), full_fit(held, fixed=fixed) or held))
 

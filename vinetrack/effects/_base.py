@@ -140,7 +140,8 @@ class Parameter:
     `vine`, or of one `day` where the sheet states it for every trial, else of one vine: a camera is set up anew for
     either. `bounds` are the physical limits, `plausible` the range that an experimenter would expect. A `held`
     parameter is known and fixed unless it is freed by name. For a shape parameter, `tried` are the values at which a
-    diagnosis tests the effect; by default two or three of the plausible range. Values a `period` apart are equivalent.
+    diagnosis tests the effect; by default two or three of the plausible range. For a size they are far ones, from which
+    it is fitted as well where a model fits poorly. Values a `period` apart are equivalent.
     `slips` are sizes of a relative error that a common slip in the sheet causes, each with a description; such a size
     is plausible however large it is.
     """

@@ -9,6 +9,7 @@ import difflib
 import math
 import re
 from collections.abc import Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
-from vinetrack.core.tables import Table, read_table, safe_join
+from vinetrack.core.tables import Table, parse_number, read_table, safe_join
 from vinetrack.core.units import UNITS, convert, pressure_text
 from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
@@ -151,18 +152,21 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
         row.add(code, message, "trial", value=name, allowed=COLUMNS["trial"].allowed, remedy=remedy)
     for name, column in COLUMNS.items():
+        typed = text = cells.get(name, "")
+        if text and (of_column := table.units.get(name)):
+            with suppress(InputError):  # as it stands in the sheet, in the unit of its column
+                value = convert(parse_number(text, table.decimal), column.unit_key, of_column)
+                typed = f"{value:.6g} {UNITS[of_column].text}"
         try:
-            if text := cells.get(name, ""):
+            if text:
                 row.values[name] = column.read(text, table.decimal)
-                if said := column.unusual(value := row.values[name]):
-                    if typed := table.units.get(name):
-                        was = f"{convert(value, column.unit_key, typed):.6g} {UNITS[typed].text}"
-                        said = f"is unusual: {was} was typed: is the unit in the name of its column right?"
-                    row.add("unusual", said, name, "warning", value=text)
+                if said := column.unusual(row.values[name]):
+                    said = said if typed == text else "is unusual: is the unit in the name of its column right?"
+                    row.add("unusual", said, name, "warning", value=typed)
             elif name in SHARED and (shared := getattr(settings, name)) is not None:
                 row.values[name] = shared
         except InputError as error:
-            row.add_error(error, name, text)
+            row.add_error(error, name, typed)
     if table.extra[index]:
         message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
         row.add("more_cells", message, remedy="put text that contains separators, and decimal commas, in quotes")
