@@ -195,7 +195,7 @@ def save_explorer(results: Path, scratch: Path) -> None:
         page.click("tick_reservoir_depletion", "input")
         page.until("$headline.text.includes('reservoir depletion')", "the effect to be in")
         page.click("refit")
-        page.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the refit", 300)
+        page.until("$refit.label === 'Refit' && $numbers.text.includes('+1 parameters')", "the refit", 300)
         page.until("$film_figure.visible && $film_edges.data.xs.length === 3", "the recording", 120)
         after = off_by(page.text("headline"))
         browser.run("scrollTo(0, 0)")

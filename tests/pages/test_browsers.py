@@ -56,7 +56,7 @@ def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_
     visitor.click("as_fitted")
     visitor.until("!$tick_reservoir_depletion.active", "what was dragged to go")
     visitor.click("tick_reservoir_depletion", "input")
-    visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the fit", 240)
+    visitor.until("$refit.label === 'Refit' && $numbers.text.includes('+1 parameters')", "the fit", 240)
     # The effect that is missing brings every condition to what an adequate model would show.
     assert (errors() < errors("highest")).all()
 

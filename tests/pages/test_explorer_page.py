@@ -134,7 +134,7 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser):
     gamma, *sigma = re.findall(r"[\d.]+", found)[:2]
     # 1.4 is what the trials were grown with, and the largest that a gas can have.
     assert (gamma, "at its bound" in found) == ("1.4", True) or abs(float(gamma) - 1.4) < 2 * float(sigma[0]) < 0.03
-    assert re.search(r"−2 ln L fell by [\d,.]+ for 1 parameter more", browser.text("numbers"))
+    assert re.search(r"Δχ² = [\d,.]+ for \+1 parameters", browser.text("numbers"))
     browser.click("hold")
     browser.model(GAMMA).value = 1.2
     browser.turn()

@@ -329,8 +329,7 @@ def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) 
     # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
         if other := next(path.parent.glob("[eE]xperiment.[yY]*"), None):
-            remedy = f"rename it to {path.name}"
-            raise ExperimentError([Problem("misnamed", "is not read under this name", file=other.name, remedy=remedy)])
+            raise ExperimentError([Problem("misnamed", f"is not read: rename it to {path.name}", file=other.name)])
         return ExperimentSettings()
     document = read_yaml(path)
     _to_key_units(document, path.name, [] if warnings is None else warnings)

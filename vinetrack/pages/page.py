@@ -24,7 +24,7 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit, number
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
+from vinetrack.inference.fit_result import Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.narrative.verdict_text import Row, quantity_text, spaced_name, verdict_table
 from vinetrack.pages.campaign import (
@@ -93,7 +93,8 @@ def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequ
     """Return two models compared, the last fit of this page as it is printed, and all its fits."""
     if not fits:
         return panel("numbers", compared=compared)
-    fit = fits[-1].fit
+    before, fit = fits[max(len(fits) - 2, 0)].fit, fits[-1].fit
+    gain, more = 2 * (fit.log_likelihood - before.log_likelihood), len(fit.numbers) - len(before.numbers)
     ladder = [(model_text(each.choice.effects), _in_mm(each.prediction.rms_m)) for each in fits]
     return panel(
         "numbers",
@@ -102,17 +103,8 @@ def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequ
         sizes_changed=sizes_changed,
         notes=numbers_text(fit)[1 + len(fit.numbers) :],
         ladder=ladder,
-        gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
+        gained=f"Δχ² = {gain:,.1f} for {more:+d} parameters." if len(fits) > 1 else "",
     )
-
-
-def likelihood_change_text(before: Fit, after: Fit) -> str:
-    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
-    gain = 2 * (after.log_likelihood - before.log_likelihood)
-    more = len(after.numbers) - len(before.numbers)
-    count = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
-    change = f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f}"
-    return f"{change} for {count}." if more else f"{change} with the same number of parameters."
 
 
 def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
