@@ -99,10 +99,6 @@ def imports(path: Path, at_import_only: bool = False) -> set[str]:
     return found
 
 
-def rooms_used(path: Path) -> set[str]:
-    return {name.split(".")[1] for name in imports(path) if name.startswith("vinetrack.")}
-
-
 def constants(path: Path) -> int:
     """Module-level names in capitals that a file assigns."""
     count = 0
@@ -131,7 +127,7 @@ def test_every_room_and_the_tests_stay_within_their_budgets():
 
 
 def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_the_laboratory():
-    rooms = {path: rooms_used(path) - {room(path)} for path in FILES}
+    rooms = {p: {n.split(".")[1] for n in imports(p) if n.startswith("vinetrack.")} - {room(p)} for p in FILES}
     top = len(FLOORS)  # where the package's own __init__.py stands
     above = [(path, one) for path, used in rooms.items() for one in used if FLOORS[one] > FLOORS.get(room(path), top)]
     assert not above

@@ -248,7 +248,6 @@ def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(ca
 def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value():
     drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
     assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
-    assert slider_range("air_drag.C_D", drag, 17.0) == (0.0, 21.25)
     assert slider_range("air_drag.C_D", drag, 200.0)[1] == 200.0
     gauge = Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3))
     assert slider_range("pressure_gauge.delta", gauge, -3e3) == (-3e3, 2e3)

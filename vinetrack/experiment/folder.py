@@ -139,10 +139,9 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.faulty for row in in_use)):
         raise ExperimentError(problems)
-    # The everting vines for which a column that may be blank or unknown is.
-    open_columns = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
+    may_be_blank = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
     vines = [row for row in in_use if row.travel_ratio == 2]
-    blank = {column: tuple(row.name for row in vines if column not in row.values) for column in open_columns}
+    blank = {column: tuple(row.name for row in vines if column not in row.values) for column in may_be_blank}
     trials = [make_trial(row, folder, settings) for row in in_use if not row.faulty]
     trials = [replace(trial, corrections=corrections.get(trial.name, ())) if trial.video else trial for trial in trials]
     reasons = {row.name: "; ".join(p.reason for p in row.problems if p.severity == "error") for row in in_use}

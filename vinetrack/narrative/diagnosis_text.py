@@ -51,11 +51,6 @@ def size_text(power: EffectPower, value: float) -> str:
     return f"{number(factor * value, 2)} {unit}".strip()
 
 
-def false_alarm_sentence(power: Power) -> str:
-    """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
-    return sentence("false_alarms", {"rate": power.false_alarm_rate})
-
-
 def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, ...]]:
     """Return a row for each effect, with the columns of `POWER_COLUMNS`."""
     rows = []
@@ -80,7 +75,7 @@ def power_lines(power: Power) -> list[str]:
         lines.append(f"! {power.wary}")
     lines += table(listed, POWER_COLUMNS, indent="  ", align="<" * len(POWER_COLUMNS))
     lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
-    lines.append(false_alarm_sentence(power))
+    lines.append(sentence("false_alarms", {"rate": power.false_alarm_rate}))
     if power.numbers:
         halves = [percent(one.half_width) if one.name == "B" else number(one.half_width, 2) for one in power.numbers]
         names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
@@ -462,12 +457,6 @@ def value_in_unit(value: float, unit: str, pressure_unit: str = "kPa") -> str:
     return "never" if math.isinf(value) else number(value * factor)
 
 
-def _changes(changes: Sequence[tuple[str, float, str]]) -> str:
-    """The first four numbers with the sizes of their changes, in display units."""
-    told = [f"{name} by {size:.2g} {unit}".rstrip() for name, size, unit in changes]
-    return ", ".join(told[:4]) + (f", and {len(told) - 4} more" if len(told) > 4 else "")
-
-
 # Facts in words, by the names that `sentences.csv` gives them in place of a format
 FORMS: dict[str, Callable[[Any], str]] = {
     "and": joined,
@@ -479,7 +468,10 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "code": lambda names: f"`{'` and `'.join(names)}`",
     "number": number,
     "word": lambda count: ("two", "three", "four", "five")[count - 2],
-    "changes": _changes,
+    "changes": lambda changes: (
+        ", ".join(f"{name} by {size:.2g} {unit}".rstrip() for name, size, unit in changes[:4])
+        + (f", and {len(changes) - 4} more" if len(changes) > 4 else "")
+    ),
     "remedy": lambda source: SHARED_REMEDIES[source],
     "pressure": lambda pressure_in: pressure_text(*pressure_in),
     "condition": lambda condition: _condition_text(**condition),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import logging
 import math
@@ -36,7 +35,7 @@ from vinetrack.pages import draft_files as files
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
-from vinetrack.report.build import TOKENS
+from vinetrack.report.build import TOKENS, base64_uri
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
 from vinetrack.video.axis import Axis, axis_entry, axis_through
 from vinetrack.video.calibration import find_board
@@ -45,7 +44,7 @@ from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_
 from vinetrack.video.track import Tracking
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 # ------------------------------------------------------------------------------
 # Views of a recording for the page: frames as JPEG, the proposed axis, and the result of tracking.
@@ -128,8 +127,13 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
     drawn = track if timed else replace(track, time_s=np.full_like(track.time_s, np.nan))
     fig = draw_strip(trial.name, replace(tracking, track=drawn), mm_per_px / 1e3, trial.pressure_unit)
     _, _, bottom_in, top_in = fig.axes[0].images[0].get_extent()
+    # In the colours of the screen: a filter as elsewhere would turn the greys of the recording too.
+    svg = render(fig, ["svg"])["svg"].decode()
+    for colour, token in TOKENS.items():
+        svg = svg.replace(colour, f"var({token})")
+    svg = svg.replace("<defs>", f"<style>{TOKENS_CSS.read_text(encoding='utf-8')}</style><defs>", 1)
     return {
-        "strip": _strip_url(fig),
+        "strip": base64_uri("image/svg+xml", svg.encode()),
         # Where in the figure its frames are, from above, as shares of its height
         "frames_at": [1 - top_in / fig.get_figheight(), 1 - bottom_in / fig.get_figheight()],
         "frames": [int(tracking.strip_rows[0]), int(tracking.strip_rows[-1])],
@@ -146,15 +150,6 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
         "scaled": scaled,
         "notes": [*notes, *track.notes],
     }
-
-
-def _strip_url(fig: Figure) -> str:
-    """A figure with a recording in it, in the colours of the screen: a filter as elsewhere would turn its greys too."""
-    svg = render(fig, ["svg"])["svg"].decode()
-    for colour, token in TOKENS.items():
-        svg = svg.replace(colour, f"var({token})")
-    svg = svg.replace("<defs>", f"<style>{TOKENS_CSS.read_text(encoding='utf-8')}</style><defs>", 1)
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 # ------------------------------------------------------------------------------

@@ -592,15 +592,14 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     as_stated = _middle_ratio(pairs)
     psi, stated = convert(1.0, "psi", "kPa"), pairs[0][0].pressure_unit if pairs else "kPa"
     factor, right, wrong = (psi, "psi", "kPa") if as_stated < 1 else (1 / psi, "kPa", "psi")
-    how_much = f"(1 psi is {psi:.4g} kPa)"
-    other_unit = f"{right}, not {wrong} {how_much}", "in the other unit", f"name the column pressure_{right}"
+    unit = f"{right}, not {wrong} (1 psi is {psi:.4g} kPa)", "in the other unit", f"name the column pressure_{right}"
     absolute = "absolute pressure", "after the ambient pressure is subtracted", "state gauge pressure"
     gauge = [(replace(t, pressure_Pa=t.pressure_Pa - t.ambient_pressure_Pa), speed) for t, speed in pairs]
     converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs if stated == wrong]
     with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
     gauge = gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else []
     place: dict[str, Any] = {"file": "trials.csv", "severity": "warning"}
-    for meant, (what, how, remedy) in ((gauge, absolute), (converted, other_unit), (with_yield, other_unit)):
+    for meant, (what, how, remedy) in ((gauge, absolute), (converted, unit), (with_yield, unit)):
         ratio = _middle_ratio(meant)
         if not 1 / far_off < as_stated < far_off and 1 / near < ratio < near:
             message = (

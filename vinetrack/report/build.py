@@ -7,9 +7,10 @@ import contextlib
 import io
 import math
 import re
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -24,14 +25,8 @@ from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION, rows
-from vinetrack.narrative.diagnosis_text import (
-    LAW_METHODS,
-    POWER_COLUMNS,
-    damping_headline,
-    false_alarm_sentence,
-    power_rows,
-    status_tally,
-)
+from vinetrack.narrative import sentence
+from vinetrack.narrative.diagnosis_text import LAW_METHODS, POWER_COLUMNS, damping_headline, power_rows, status_tally
 from vinetrack.narrative.verdict_text import (
     bounds_text,
     estimates_text,
@@ -171,8 +166,10 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
         rounds.append({"ranking": ranking, "n_below": len(testable) - len(ranking), "blind": blind, "of": entry})
     sizes, power = [], diagnosis.power
-    wary = [f"Detectable sizes were not computed: {power.wary}."] if power is not None and power.wary else []
-    if power is not None and not power.wary:
+    told = [sentence("false_alarms", {"rate": power.false_alarm_rate})] if power is not None else []
+    if power is not None and power.wary:
+        told.append(f"Detectable sizes were not computed: {power.wary}.")
+    elif power is not None:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     # Upper limits are valid only if no effect is missing.
     last = diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else ()
@@ -187,11 +184,11 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "kind": badge if badge in VERDICTS and not diagnosis.contradicted_columns else "none",
         "sentence": verdict_sentence(diagnosis),
         "summaries": [effects[name].summary for name in named if name in effects],
-        "table": verdict_table(diagnosis),
+        "table": verdict_table(replace(diagnosis, results=shlex.quote(f"results/{content['name']}"))),
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
         "rounds": rounds,
         "hidden": hidden,
-        "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes, "columns": columns},
+        "power": power and {"sentences": told, "sizes": sizes, "columns": columns},
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
@@ -329,16 +326,11 @@ def every_row(table: pd.DataFrame) -> ReportTable:
     for row in rows(table):
         what = ", ".join(filter(None, (row.quantity, row.setting))) + (f" ({row.unit})" if row.unit != "1" else "")
         remarks = "; ".join(filter(None, (row.how, row.beside)))
-        body.append((row.where, what, row.as_printed, _ours(row), row.mark, remarks))
+        whole = abs(row.ours - np.round(row.ours)) <= 1e-9 * abs(row.ours)
+        ours, bounds = f"{row.ours:.0f}" if whole else number(row.ours), interval((row.ours_low_95, row.ours_high_95))
+        ours += f" ({bounds})" if math.isfinite(row.ours) and bounds != "–" else ""
+        body.append((row.where, what, row.as_printed, ours, row.mark, remarks))
     return ReportTable("Every number", head, body, frozenset({2, 3}))
-
-
-def _ours(row: Any) -> str:
-    if not math.isfinite(row.ours):
-        return "–"
-    whole = math.isclose(row.ours, round(row.ours), rel_tol=1e-9)
-    shown, bounds = f"{row.ours:.0f}" if whole else number(row.ours), interval((row.ours_low_95, row.ours_high_95))
-    return f"{shown} ({bounds})" if bounds != "–" else shown
 
 
 # ------------------------------------------------------------------------------
