@@ -191,11 +191,15 @@ class Search:
         """
         names = frozenset(effect.name for effect in effects)
         if again or names not in self.fitted:
-            with suppress(FitError, SimulationError, np.linalg.LinAlgError):
-                after = refit(hypothesis.fit, reduce(Model.__add__, effects, self.before.model))
-                self._keep_best(likelihood_ratio(self.before, effects, after))
+            self._refit(hypothesis.fit, effects)
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
+
+    def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
+        """Keep a set that is fitted from another one, unless no fit succeeds."""
+        with suppress(FitError, SimulationError, np.linalg.LinAlgError):
+            after = refit(fit, reduce(Model.__add__, effects, self.before.model))
+            self._keep_best(likelihood_ratio(self.before, effects, after))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low, or not known."""

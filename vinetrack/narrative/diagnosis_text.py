@@ -13,7 +13,6 @@ from vinetrack.core.problems import joined
 from vinetrack.core.terminal import table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
 from vinetrack.diagnosis.result import EXPECTED, NOT_TESTABLE, Diagnosis, Round
-from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative import sentence
 from vinetrack.narrative.verdict_text import (
@@ -135,12 +134,6 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 
 # ------------------------------------------------------------------------------
 # The next experiment in sentences: trials to make, hypotheses that they separate, and what to measure instead.
-
-
-def measurement_text(effects: Sequence[Effect]) -> str:
-    """Return what to measure in order to exclude one of the hypotheses, as the files of their effects state."""
-    told = [(effect.name, " ".join(filter(None, (effect.told_apart, effect.remedy)))) for effect in effects]
-    return " ".join(f"{name}: {words[0].lower()}{words[1:]}" for name, words in told if words)
 
 
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
@@ -506,7 +499,11 @@ REMARKS: dict[str, Callable[..., str]] = {
     ),
     "implausible_size": _implausible_text,
     "odd_trials": odd_in_words,
-    "deciding_measurements": measurement_text,
+    "deciding_measurements": lambda effects: " ".join(
+        f"{one.name}: {words[0].lower()}{words[1:]}"
+        for one in effects
+        if (words := " ".join(filter(None, (one.told_apart, one.remedy))))
+    ),
     "trials_to_make": advice_text,
     "law": law_text,
     "fails_most": fails_most_text,
