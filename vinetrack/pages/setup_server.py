@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +42,6 @@ from vinetrack.video.calibration import find_board
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_problems, tracked_facts
 from vinetrack.video.track import Tracking
-
-if TYPE_CHECKING:
-    pass
 
 # ------------------------------------------------------------------------------
 # Views of a recording for the page: frames as JPEG, the proposed axis, and the result of tracking.
