@@ -28,5 +28,6 @@ def ruler_picture(
     tall_mm = np.where(count % 10 == 0, 9.0, np.where(count % 5 == 0, 6.8, 4.4))
     on = (abs(mm + length_mm / 2 - count * marks_mm) < 0.13) & (count >= 0) & (count * marks_mm <= length_mm + 0.1)
     picture[on & (aside_mm > 0) & (aside_mm < tall_mm)] = ink
-    small = cv2.GaussianBlur(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), (0, 0), blur_px)
+    # A lens blurs before pixels sample: blurred after, marks of 2.5 px/mm would alternate as every second mark does.
+    small = cv2.resize(cv2.GaussianBlur(picture, (0, 0), fine * blur_px), size, interpolation=cv2.INTER_AREA)
     return np.clip(small + rng.normal(0, 2.5, small.shape), 0, 255).astype(np.uint8)

@@ -424,6 +424,8 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
         vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
     with pytest.raises(vt.FitError):
         fit_subset(whole, [False] * len(whole.trials))
+    with pytest.raises(vt.FitError):
+        vt.refit(whole, "leak")
 
 
 def test_yield_pressures_without_error_are_no_parameters(campaign):

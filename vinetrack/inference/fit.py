@@ -509,6 +509,8 @@ def refit(
     True
     """
     model = model or before.model
+    if not isinstance(model, Model):
+        raise FitError(f"{model!r} is no model: give the whole model, fit.model + {model!r} for one effect more.")
     fitted_values = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**fitted_values, **(start or {})})
     data = before.predictor.data

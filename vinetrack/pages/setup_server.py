@@ -216,8 +216,8 @@ def _marks_along(grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], rat
     places = np.interp(np.arange(math.ceil(count[0]), math.floor(count[-1]) + 1), count, at)
     shapes = np.interp(places[1:-1, None] + np.arange(-8, 8) / (16 * rate), u, level)
     rest = shapes.sum(axis=0) - shapes
-    likeness = np.median([np.corrcoef(*pair)[0, 1] for pair in zip(shapes, rest, strict=True)])
-    if len(places) <= FEWEST_SPACINGS or not likeness > 0.85:  # chosen
+    likeness = np.quantile([np.corrcoef(*pair)[0, 1] for pair in zip(shapes, rest, strict=True)], 0.25)
+    if len(places) <= FEWEST_SPACINGS or not likeness > 0.7:  # chosen
         return None
     gaps = np.diff(places)
     return {

@@ -34,7 +34,7 @@ from vinetrack.video.edge import tube_strip
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, track_pixels
+from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, too_few, track_pixels
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -435,8 +435,7 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
     ]
     declared, present = recording.declared_frames, _frames_present(recording)
     if present is not None and present < FEWEST_FRAMES:
-        remedy = f"at least {FEWEST_FRAMES} are needed"
-        return [*problems, Problem(message=f"has {present} frames", remedy=remedy, **place)]
+        return [*problems, Problem(message=too_few(present), remedy="name a film or a folder of pictures", **place)]
     if declared is not None and present is not None and present < declared:
         message = f"is cut short: {present} of the {declared} frames that it declares are there"
         remedy = "copy it from the camera again"

@@ -125,6 +125,13 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
+
+def too_few(frames: int) -> str:
+    """Say that a recording, or a picture taken for one, has too few frames."""
+    what = "is a single picture" if frames == 1 else f"has {frames} frames"
+    return f"{what}; a track needs at least {FEWEST_FRAMES} frames"
+
+
 STABILISED_PX = 0.05  # Error left after a shaken camera was stabilised on the still background (measured)
 
 
@@ -217,7 +224,7 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
     """
     name = frames.recording.path.name
     if len(frames) < FEWEST_FRAMES:
-        raise RecordingError(f"only {len(frames)} frames can be decoded", f"at least {FEWEST_FRAMES} are needed", name)
+        raise RecordingError(too_few(len(frames)), "name a film or a folder of pictures", name)
     odd = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
     first, last = trial.frames_used or (0, len(frames.slots) - 1)
     number = frames.first + np.arange(len(frames))
