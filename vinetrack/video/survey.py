@@ -434,12 +434,12 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
         for note in recording.notes
     ]
     declared, present = recording.declared_frames, _frames_present(recording)
-    if present is not None and present < FEWEST_FRAMES:
-        return [*problems, Problem(message=too_few(present), remedy="name a film or a folder of pictures", **place)]
-    if declared is not None and present is not None and present < declared:
+    if present is not None and declared is not None and present < declared:
         message = f"is cut short: {present} of the {declared} frames that it declares are there"
-        remedy = "copy it from the camera again"
-        problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
+        severity, remedy = "error" if present < FEWEST_FRAMES else "warning", "copy it from the camera again"
+        problems.append(Problem(message=message, severity=severity, remedy=remedy, **place))
+    elif present is not None and present < FEWEST_FRAMES:
+        problems.append(Problem(message=too_few(present), remedy="name a film or a folder of pictures", **place))
     return problems
 
 
