@@ -33,7 +33,7 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, predict_choice, slider_range
-from vinetrack.pages.page import Page, open_campaign, start_server
+from vinetrack.pages.page import Page, open_campaign, start_server, suspects
 from vinetrack.pages.plots import RecordingView, decode, recording_view
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
@@ -159,6 +159,8 @@ def test_a_diagnosis_appears_when_the_page_is_opened_again(campaign, background,
     assert "(cosine 0.970)" in again.text("tied")
     assert "chamber (l)" in again.text("next")
     assert again.page.panel.root.children[0].children[0].label == "Suspected by the diagnosis"
+    known = again.page.diagnosis
+    assert suspects(replace(known, rounds=(replace(known.rounds[0], verdict="adequate"),))) == ()
     again.page.close()
     (folder / "diagnosis.json").write_text("[]", encoding="utf-8")
     Browser(own).page.close()  # opens with a diagnosis that is torn

@@ -7,7 +7,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -326,15 +326,6 @@ class Evaluated:
         return {number.name: number for number in self.fit.numbers}
 
 
-def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:
-    """Fit the model in use, as the model stage of the workflow does."""
-    model = replace(sized_model(campaign, choice), values={})
-    # A falling body has no other parameter.
-    free = ("gravity.g",) if model.names == ("gravity",) else ()
-    fitted = fit(model, campaign.pairs, free=free, host=campaign.host, watch=watch)
-    return _evaluated(campaign, choice, fitted)
-
-
 @in_one_blas_thread
 def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:
     """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects. If the result is worse
@@ -373,12 +364,32 @@ class Job(Generic[Progress, Outcome]):
         work: Callable[[Callable[[Progress], None]], Outcome],
         on_progress: Callable[[Progress], None],
         on_end: Callable[[Outcome | None, str], None],
-        soon: Callable[[Callable[[], None]], object] | None = None,
+        soon: Callable[[Callable[[], None]], object] = lambda call: call(),
     ) -> None:
-        self._work, self._on_progress, self._on_end = work, on_progress, on_end
-        self._soon = soon or (lambda call: call())
         self._cancelled = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}job")
+
+        def watch(step: Progress) -> None:
+            if self._cancelled.is_set():
+                raise Cancelled
+            on_progress(step)
+
+        def run() -> None:
+            outcome, reason = None, ""
+            try:
+                outcome = work(watch)
+            except Cancelled:
+                return
+            except UserError as error:
+                reason = str(error)
+            except Exception:
+                log.exception("a job of the explorer")
+                reason = (
+                    "A fault of the program, not of your data: --log FILE of vinetrack explore keeps the traceback."
+                )
+            # It may be cancelled while it waits to be called.
+            soon(lambda: None if self._cancelled.is_set() else on_end(outcome, reason))
+
+        self._thread = threading.Thread(target=run, daemon=True, name=f"{THREAD_PREFIX}job")
         self._thread.start()
 
     def cancel(self) -> None:
@@ -388,28 +399,6 @@ class Job(Generic[Progress, Outcome]):
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until it has ended."""
         self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        outcome, reason = None, ""
-        try:
-            outcome = self._work(self._watch)
-        except Cancelled:
-            return
-        except UserError as error:
-            reason = str(error)
-        except Exception:
-            log.exception("a job of the explorer")
-            reason = "A fault of the program, not of your data: --log FILE of vinetrack explore keeps the traceback."
-        self._soon(partial(self._tell, outcome, reason))
-
-    def _tell(self, outcome: Outcome | None, reason: str) -> None:
-        if not self._cancelled.is_set():  # as it may have been while it waited to be called
-            self._on_end(outcome, reason)
-
-    def _watch(self, step: Progress) -> None:
-        if self._cancelled.is_set():
-            raise Cancelled
-        self._on_progress(step)
 
 
 class BackgroundFit:
@@ -447,9 +436,14 @@ class BackgroundFit:
         return self._job is not None and self.fitted is None and not self.failure
 
     def _work(self, watch: Watch) -> Evaluated:
-        self.prediction = predict_choice(self.campaign, self.initial)
+        """Predict, then fit the model in use as the model stage of the workflow does."""
+        campaign, initial = self.campaign, self.initial
+        self.prediction = predict_choice(campaign, initial)
         self._notify()
-        return first_fit(self.campaign, self.initial, watch)
+        model = replace(sized_model(campaign, initial), values={})
+        # A falling body has no other parameter.
+        free = ("gravity.g",) if model.names == ("gravity",) else ()
+        return _evaluated(campaign, initial, fit(model, campaign.pairs, free=free, host=campaign.host, watch=watch))
 
     def _on_step(self, step: Step) -> None:
         self.step = step

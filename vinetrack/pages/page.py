@@ -21,7 +21,7 @@ from tornado.ioloop import IOLoop
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
 from vinetrack.core.units import SLIDER_UNITS, display_unit, number
-from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.diagnosis.result import ADEQUATE, Diagnosis
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Number, number_row, numbers_text
@@ -108,8 +108,8 @@ def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequ
 
 
 def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
-    """Return the effects worth trying first, best first."""
-    if diagnosis is None:
+    """Return the effects worth trying first, best first; none where the model is adequate."""
+    if diagnosis is None or diagnosis.verdict == ADEQUATE:
         return ()
     ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
     return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
