@@ -61,14 +61,8 @@ def test_both_fits_are_lines_of_slope_n_in_the_band_of_the_covariance():
 def scaling() -> dict:
     sizes = [6.0, 12.0, 18.0, 24.0]
     B = [math.exp(-3.0) * size**1.8 for size in sizes]
-    power = {
-        "slope": 1.8,
-        "slope_95": [1.2, 2.4],
-        "intercept": -3.0,
-        "intercept_95": [-4.0, -2.0],
-        "R2": 0.98,
-        "p": 0.01,
-    }
+    power = {"slope": 1.8, "slope_95": [1.2, 2.4], "intercept": -3.0, "intercept_95": [-4.0, -2.0], "R2": 0.98}
+    power["p"] = 0.01
     family = {"along": "diameter_mm", "vines": [f"vine{i}" for i in range(4)], "sizes": sizes, "B": B}
     family |= {"B_95_total": [[0.9 * b, 1.1 * b] for b in B], "power": power, "line": power | {"slope": 0.3}}
     family |= {"refused": None}

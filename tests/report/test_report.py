@@ -215,13 +215,8 @@ FIT |= {"messages": ["a message"], "warnings": ["a warning"], "left_out": {"b": 
 
 
 def result(**changes: object) -> dict[str, object]:
-    at = {
-        "rms_final_velocity_m_s": 0.25,
-        "replicate_floor_m": 1e-3,
-        **dict.fromkeys(("expected_m", "expected_low_m", "expected_high_m"), 1e-3),
-        "worst_at_s": 0.07,
-        "worst_at_m": 0.123,
-    }
+    at = dict.fromkeys(("expected_m", "expected_low_m", "expected_high_m", "replicate_floor_m"), 1e-3)
+    at |= {"rms_final_velocity_m_s": 0.25, "worst_at_s": 0.07, "worst_at_m": 0.123}
     compared = pd.DataFrame({"condition": ["c0", "c1"], "rms_position_m": [3e-3, 4e-3], "n_trials": [3, 1], **at})
     check = {"vine": ["v"], "n_steady": 0.37, "n_trajectory": 0.49, "B_steady": 6.44, "B_trajectory": 6.1, "z": 5.1}
     return {"fit": FitSummary.from_json({**FIT, **changes}), "comparison": compared, "check": pd.DataFrame(check)}

@@ -368,11 +368,9 @@ GRAINS = [{}, {"wall_sd": 30.0, "tail_sd": 30.0}, {"wall_sd": 5.0, "tail_sd": 45
 @pytest.mark.parametrize("changes", [*GRAINS, {"door": True}])
 def test_stated_errors_match_the_true_errors(changes):
     """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
-    short = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
     pulls = []
     for seed in (331, 332):
-        scene = plain_scene(Plan(**{**short, **changes, "seed": seed}))
-        tracking = pictures.tracked(scene.frames, scene.plan.exposure)
+        scene, tracking = followed(**changes, seed=seed)
         use = scene.moving & tracking.track.usable
         error = (tracking.track.edge_px + tracking.axis.from_px[0] - scene.edge_px)[use]
         sigma = tracking.track.lead_position_sigma_m[use] * 1e3

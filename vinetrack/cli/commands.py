@@ -87,7 +87,7 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
 
     def summary() -> tuple[list[str], bool]:
         from vinetrack.narrative.diagnosis_text import failures_told, table_lines
-        from vinetrack.narrative.verdict_text import verdict_line
+        from vinetrack.narrative.verdict_text import verdict_line, verdict_table
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
         told, most = failures_told(trials)
@@ -95,7 +95,8 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
         if diagnosis is not None and diagnosis.verdict:
             lines += table_lines(diagnosis, in_short=True)
             notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
-            lines += [*notes, verdict_line(diagnosis)]
+            then = verdict_table(diagnosis)[0].note
+            lines += [*notes, f"{verdict_line(diagnosis)}{f'. {then}' if then else ''}"]
         elif diagnosis is not None and not most:
             lines.append(diagnosis.explanation)
         return [*lines, told] if most else lines, most

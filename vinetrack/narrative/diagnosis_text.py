@@ -232,7 +232,7 @@ def table_lines(diagnosis: Diagnosis, in_short: bool = False) -> list[str]:
     """
     first, *rows = verdict_table(diagnosis)
     width = max((len(row.question) for row in rows), default=0)
-    lines = [f"  {first.note}"] if first.note else []
+    lines = [f"  {first.note}"] if first.note and not in_short else []
     for row in rows:
         most = (2 if row.question.startswith(("F =", "What to do")) else 1) if in_short else None
         texts = [row.answer] if in_short else [row.answer, row.note]

@@ -73,6 +73,10 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
     ]
     if limits.new_vines:
         vines += [(vine, like, NEW_VINE) for vine, like in _new_vines(models, limits)]
+    loads = {trial.payload_kg for trial in used}
+    # No payload (or the lightest allowed), the heaviest (0.05 kg where none was used yet), and those used in between
+    low, high = _stated(limits, "payload_g") or (0.0, max(loads, default=0.0) or 0.05)
+    payloads = sorted({low, high, *(payload for payload in loads if low <= payload <= high)})
     conditions: list[Condition] = []
     for vine, like, effort_of_vine in vines:
         rigs = _rigs(vine, used, limits)
@@ -80,7 +84,7 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
         for effort, rig in rigs:
             if effort_of_vine == NEW_VINE and effort > least:
                 continue
-            for payload in _payloads(used, limits):
+            for payload in payloads:
                 for pressure, sigma in _pressures(rig, payload, used, limits):
                     name = f"next_{len(conditions) + 1}"
                     trial = replace(rig, name=name, payload_kg=payload, pressure_Pa=pressure, pressure_sigma_Pa=sigma)
@@ -145,14 +149,6 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
     fewest = min((changes for changes, _, _ in rigs), default=0)
     return [(effort, rig) for changes, effort, rig in rigs if changes <= max(1, fewest)]
-
-
-def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
-    """No payload (or the lightest allowed), the heaviest, and those used in between."""
-    payloads = {trial.payload_kg for trial in used}
-    heaviest = max(payloads) if max(payloads) > 0 else 0.05  # kg, where none was used yet
-    low, high = _stated(limits, "payload_g") or (0.0, heaviest)
-    return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
 
 
 def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
