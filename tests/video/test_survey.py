@@ -68,6 +68,8 @@ def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path, name)
     assert check(tmp_path, name) == ["warning t0 video", "error t0 video"]  # noise, in which nothing grows
     problem, _ = check_experiment(tmp_path, Surveyor())
     assert 25 <= int(problem.message.split(":")[1].split()[0]) <= 40
+    write_clip(tmp_path / name, 60, share=0.08)  # fewer than a track needs
+    assert [(one.code, one.severity) for one in check_experiment(tmp_path, Surveyor())] == [("cut_short", "error")]
 
 
 def test_a_rate_that_contradicts_the_frames_own_is_refused(tmp_path, monkeypatch):

@@ -437,7 +437,7 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
     if present is not None and declared is not None and present < declared:
         message = f"is cut short: {present} of the {declared} frames that it declares are there"
         severity, remedy = "error" if present < FEWEST_FRAMES else "warning", "copy it from the camera again"
-        problems.append(Problem(message=message, severity=severity, remedy=remedy, **place))
+        problems.append(Problem("cut_short", message, severity=severity, remedy=remedy, **place))
     elif present is not None and present < FEWEST_FRAMES:
         problems.append(Problem(message=too_few(present), remedy="name a film or a folder of pictures", **place))
     return problems
