@@ -10,6 +10,7 @@ import importlib.util
 import os
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,6 +126,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.diagnosis.diagnose import diagnose
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
+    from vinetrack.kinematics.summary import look_at_motions
     from vinetrack.pipeline.model_stage import diagnosed, write_diagnosis
     from vinetrack.pipeline.workflow import find_experiment
     from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_source_experiment
@@ -135,7 +137,8 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
         pairs = measured_trials(source, results)
         diagnosis = diagnosed(source, results, pairs, report)
         if json is None:
-            write_diagnosis(results, diagnosis, pairs, run_settings(read_json(results.provenance)["settings"]))
+            settings = run_settings(read_json(results.provenance)["settings"])
+            write_diagnosis(results, diagnosis, partial(look_at_motions, pairs, settings), settings)
         return [str(diagnosis).replace("RESULTS", str(target))], diagnosis.to_json()
     read = read_experiment(find_experiment(target))
     if read.trials and all(trial.track is None for trial in read.trials):

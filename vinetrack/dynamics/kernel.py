@@ -11,6 +11,7 @@ import atexit
 import hashlib
 import importlib.util
 import inspect
+import itertools
 import math
 import os
 import shutil
@@ -227,6 +228,10 @@ _NOTHING = State(*(math.nan,) * len(State._fields))
 Trace = tuple[Floats, Floats]  # Times since release, s, and gauge pressures, Pa, measured at them
 
 
+_pool = lru_cache(ThreadPoolExecutor)  # Threads of this process, kept: starting them takes as long as a small batch
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 @dataclass(frozen=True)
 class Batch:
     """Trials laid out for the compiled kernel: prepared once, run as often as needed. `stamps`, shape (n_times,), are
@@ -258,8 +263,7 @@ class Batch:
             integrate(0, count)
         else:
             edges = np.linspace(0, count, threads + 1).astype(int)
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(integrate, edges[:-1], edges[1:]))
+            list(_pool(threads).map(integrate, edges[:-1], edges[1:]))
         return out, ends
 
 
@@ -352,11 +356,8 @@ def _limits(
             if key not in cached:
                 cached[key] = list(of_effect(TrialInputs(*inputs[k]), *thetas[k, model.places[i]]))
             positions_m[k] += cached[key]
-    breakpoints = np.full((len(inputs), 1 + max(map(len, positions_m), default=0)), math.inf)
-    breakpoints[:, 0] = floor_x_m
-    for k, positions in enumerate(positions_m):
-        breakpoints[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
-    return np.sort(breakpoints, axis=1), end
+    aligned = np.array(list(itertools.zip_longest(*positions_m, fillvalue=math.inf))).reshape(-1, len(inputs))
+    return np.sort(np.vstack([floor_x_m, aligned * np.asarray(rig.travel_ratio)]).T, axis=1), end
 
 
 def _true_times(

@@ -29,22 +29,11 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     """G₀, G₁, G₂ of one trial. Shapes: columns (n_points, k); first, relative_sd (n_points,) → (3, k, k)."""
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
-    if np.count_nonzero(first) == 1:
-        later, earlier = columns[1:], columns[:-1]
-        firsts, lasts = columns[:1], columns[-1:]
-    else:
-        with_predecessor = np.flatnonzero(~first)
-        later, earlier = columns[with_predecessor], columns[with_predecessor - 1]
-        firsts, lasts = columns[first], columns[np.append(first[1:], True)]
-    all_points, lag_one = columns.T @ columns, later.T @ earlier
-    matrices = np.empty((3, *all_points.shape))
-    # The points with a successor are all but the last of each stretch.
-    matrices[0], matrices[1], matrices[2] = (
-        all_points,
-        lag_one + lag_one.T,
-        all_points - lasts.T @ lasts - firsts.T @ firsts,
-    )
-    return matrices
+    later = np.flatnonzero(~first)
+    # Points with a successor count once more, but for the first of each stretch
+    ends = np.concatenate([columns[first], columns[np.append(first[1:], True)]])
+    all_points, lag_one = columns.T @ columns, columns[later].T @ columns[later - 1]
+    return np.stack([all_points, lag_one + lag_one.T, all_points - ends.T @ ends])
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -376,10 +376,8 @@ def _accepted_step(
     return None, 0.0
 
 
-def cost(
-    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
-) -> float:
+def cost(predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None) -> float:
     """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects.
-    Shapes: residuals (n_points,).
+    Shapes: residuals (n_points_of_all,).
     """
     return float(np.sum(trial_costs(predictor, problem, state, residuals))) + shared_penalty(problem, state)

@@ -278,23 +278,16 @@ class Predictor:
         """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         return self.run(self.jobs(theta, trial_effects))
 
-    def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of every trial. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
-        (n_points,).
+    def residuals(self, theta: Floats, trial_effects: Floats) -> Floats:
+        """Measured minus predicted positions of all trials. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
+        (n_points_of_all,).
         """
         motions = self._simulated(self.jobs(theta, trial_effects))
-        return self.by_trial(self._residuals(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects))
+        return self._residuals(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects)
 
     def _residuals(self, observed_m: Floats, trial_effects: Floats) -> Floats:
         """Measured minus predicted positions of all trials, concatenated."""
         return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
-
-    def by_trial(self, values: Floats) -> list[Floats]:
-        """Split an array over the points of all trials into one per trial. Shapes: values (n_points_of_all, …) →
-        (n_points, …).
-        """
-        edges = self.starts.tolist()
-        return [values[a:b] for a, b in itertools.pairwise(edges)]
 
     def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
@@ -338,7 +331,7 @@ class Predictor:
             responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
             self.steps = _adapted_steps(np.max(responses[:, N_TRIAL_EFFECTS:-1], axis=0, initial=0.0), self.steps)
             self.pressure_step = _adapted_steps(responses[:, PRESSURE], self.pressure_step)
-        return self.by_trial(table)
+        return np.split(table, self.starts[1:-1])
 
     def _points_of(self, trials: NDArray[np.int_]) -> slice | NDArray[np.int_]:
         """Rows of some trials among the concatenated points of all."""

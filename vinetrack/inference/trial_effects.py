@@ -156,21 +156,23 @@ def moved_effects(trial_effects: Floats, step: Floats) -> Floats:
 
 @np.errstate(over="ignore", invalid="ignore")  # of a long step: see `gaussian_processes`
 def trial_costs(
-    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
+    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None
 ) -> Floats:
     """Penalised sum of squares of each trial: its whitened residuals plus the priors of its effects. Shapes: residuals
-    (n_points,) → (n_trials,).
+    (n_points_of_all,) → (n_trials,).
     """
     if residuals is None:
         residuals = predictor.residuals(state.theta, state.trial_effects)
-    white = whiten(np.concatenate(residuals), predictor.first, state.rho, predictor.relative_sd)
-    squares = [np.sum(of_trial) for of_trial in predictor.by_trial(white**2)]
-    return np.array(squares) / state.variance + trial_effect_penalty(problem, state)
+    white = whiten(residuals, predictor.first, state.rho, predictor.relative_sd)
+    squares = np.add.reduceat(white**2, predictor.starts[:-1])
+    return np.asarray(squares / state.variance + trial_effect_penalty(problem, state))
 
 
-def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
-    """The residuals among the columns of a linearisation. Shapes: columns (n_points, k) → (n_points,)."""
-    return [np.ascontiguousarray(column[:, -1]) for column in columns]
+def residuals_in(columns: Sequence[Floats]) -> Floats:
+    """The residuals among the columns of a linearisation, of all trials. Shapes: columns (n_points, k) →
+    (n_points_of_all,).
+    """
+    return np.concatenate([column[:, -1] for column in columns])
 
 
 LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)

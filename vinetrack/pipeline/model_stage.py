@@ -41,8 +41,7 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
-from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
-from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.kinematics.summary import LAW_COLUMNS, TrialMotion, law_table, look_at_motions, redo_damping
 from vinetrack.narrative.diagnosis_text import proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
@@ -65,7 +64,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
     """
     lines, results = fit_damping(job), Results(job.results)
     job.say("fitting the model")
-    fitted, pairs = fit_model(job)
+    fitted, pairs, motions = fit_model(job)
     try:
         diagnosis = diagnosed(job.experiment, results, pairs, job.say, fitted)
     except Exception as error:
@@ -74,15 +73,17 @@ def fit_and_diagnose(job: Job) -> list[str]:
         diagnosis = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     job.say("fitting the damping law under every model")
-    write_diagnosis(results, diagnosis, pairs, job.settings)
+    write_diagnosis(results, diagnosis, lambda: motions, job.settings)
     return [*lines, str(diagnosis)]
 
 
-def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
-    """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis, with its trials."""
+def fit_model(job: Job) -> tuple[Fit | None, Pairs, list[TrialMotion]]:
+    """Fit the model in use, write the fit and what it is compared with; return it, its trials and their motions."""
     experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
     pairs = measured_trials(experiment, results)
+    seen = look_at_motions(pairs, job.settings)
+    kinematics = {motion.trial.name: motion.kinematics for motion in seen}
     initial: Fit | None = None
     try:
         model = model_of(experiment)
@@ -91,8 +92,6 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
         free = ("gravity.g",) if model.names == ("gravity",) else ()
         fit = initial_fit(model, pairs, candidates, free=free)
         initial = None if free else fit
-        how = job.settings.velocity.model_dump()
-        kinematics = {t.name: estimate_kinematics(track, travel_ratio=t.travel_ratio, **how) for t, track in pairs}
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
         check, messages = table_of(CHECK_COLUMNS), list[str]()
         try:
@@ -119,7 +118,7 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs]:
         write_csv(results.trajectories(condition), table)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
-    return initial, pairs
+    return initial, pairs, seen
 
 
 def _emptied(folder: Path) -> Path:
@@ -182,15 +181,19 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 
 
-def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
+def write_diagnosis(
+    results: Results, diagnosis: Diagnosis, motions: Callable[[], list[TrialMotion]], settings: RunSettings
+) -> None:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; the motions of all trials only where a model was
+    extended.
+    """
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
     tables = {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
     tables |= {**diagnosis_tables(diagnosis), "steps.csv": all_steps(results, ladder)}
     folder = _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
         tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
-        tables["damping_laws.csv"] = _laws(diagnosis, pairs, settings)
+        tables["damping_laws.csv"] = _laws(diagnosis, motions(), settings)
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
@@ -202,9 +205,9 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
 
 
-def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
+def _laws(diagnosis: Diagnosis, motions: list[TrialMotion], settings: RunSettings) -> pd.DataFrame:
     """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
-    laws, motions = {}, look_at_motions(pairs, settings)
+    laws = {}
     for fit in diagnosis.fits:
         try:
             laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
