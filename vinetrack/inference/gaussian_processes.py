@@ -29,10 +29,10 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     """G₀, G₁, G₂ of one trial. Shapes: columns (n_points, k); first, relative_sd (n_points,) → (3, k, k)."""
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
-    later = np.flatnonzero(~first)
-    # Points with a successor count once more, but for the first of each stretch
-    ends = np.concatenate([columns[first], columns[np.append(first[1:], True)]])
-    all_points, lag_one = columns.T @ columns, columns[later].T @ columns[later - 1]
+    firsts, lasts = columns[first], columns[np.append(first[1:], True)]
+    # Of neighbours, but for those on either side of a gap; points with a successor, but for the first of each stretch
+    lag_one = columns[1:].T @ columns[:-1] - firsts[1:].T @ lasts[:-1]
+    all_points, ends = columns.T @ columns, np.concatenate([firsts, lasts])
     return np.stack([all_points, lag_one + lag_one.T, all_points - ends.T @ ends])
 
 

@@ -266,7 +266,7 @@ def solve(
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
-        # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises, or none.
+        # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
         # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
         # release far from the current one?

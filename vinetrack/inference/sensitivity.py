@@ -122,10 +122,6 @@ class Motions:
         """
         return self.out[self.batch.starts[first] : self.batch.starts[last]]
 
-    def stamps(self, job: int) -> Floats:
-        """Times of a job since its release, s, on the camera's clock. Shape (n_times,)."""
-        return self.batch.stamps[self.batch.starts[job] : self.batch.starts[job + 1]]
-
     def trajectories(self) -> list[Trajectory]:
         """One trajectory per job."""
         return trajectories(self.batch, self.out, self.ends, self.ratios)
@@ -135,20 +131,13 @@ class Motions:
 # Finite differences of the observed positions of a trial, taken correctly across the end of growth.
 
 
-def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
-    """Set the change of position after the end of growth: that of the end position, or 0 where only the time changes.
-    Shapes: change, over (n_points,).
-    """
-    change[over] = change[-1] if moved_ends else 0.0
-
-
 def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     """Change of the observed positions of a trial under a small perturbation, m, shape (n_points,). Growth ends at the
-    same position whenever it ends. Shape (n_points,).
+    same position whenever it ends: after it the change is that of the end position, or 0 where only the time changes.
     """
     change = np.asarray(moved.observed_position_m - plain.observed_position_m)
     if plain.status == "ended":
-        clip_at_end(change, plain.time_s > plain.end_time_s, moved_ends=moved.status == "ended")
+        change[plain.time_s > plain.end_time_s] = change[-1] if moved.status == "ended" else 0.0
     plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
     early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
     last = int(np.argmax(early)) - 1
@@ -342,15 +331,13 @@ class Predictor:
         return np.flatnonzero(np.repeat(chosen, np.diff(self.starts)))
 
     def _clip_after_end(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
-        """Set the changes of position after the end of growth, see `clip_at_end`."""
-        ends = motions.ends
-        if not np.any(ends[trials, 0] == ENDED):
-            return
-        starts = starts_of([self.times_s[i] for i in trials])
-        for k, (i, perturbed_end) in enumerate(zip(trials, ends[jobs], strict=True)):
-            if ends[i, 0] == ENDED:
-                over = motions.stamps(i) > ends[i, 1]
-                clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=perturbed_end[0] == ENDED)
+        """Set the changes of position after the end of growth, see `position_change`."""
+        plain, moved = motions.ends[trials], motions.ends[jobs]
+        counts = np.diff(self.starts)[trials]
+        end_s = np.repeat(np.where(plain[:, 0] == ENDED, plain[:, 1], math.inf), counts)
+        over = motions.batch.stamps[: self.starts[-1]][self._points_of(trials)] > end_s
+        at_end = np.where(moved[:, 0] == ENDED, change[np.cumsum(counts) - 1], 0.0)
+        change[over] = np.repeat(at_end, counts)[over]
 
     def products(self, columns: Sequence[Floats]) -> Floats:
         """Cross products of the columns of every trial under its noise, see `gaussian_processes`. Shapes: columns
