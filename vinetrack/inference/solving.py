@@ -169,8 +169,9 @@ def solve_onward(
     # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
     if fixed_terms.noise is None and cost(predictor, problem, state) >= 1.5 * float(np.sum(problem.points)):
         noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
-        # 40: steps at fixed noise, at most (chosen)
-        state = replace(solve(predictor, problem, state, noise, most_iterations=40).state, spread=state.spread)
+        # 40, 10.0: steps at fixed noise, at most, and least decrease of the last (chosen)
+        reached = solve(predictor, problem, state, noise, most_iterations=40, least_decrease=10.0).state
+        state = replace(reached, spread=state.spread)
     return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
 
 
