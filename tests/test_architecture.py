@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 29),
-    "inference": (5541, 14, 51),
+    "inference": (5527, 14, 51),
     "interface": (567, 2, 2),
     "kinematics": (1618, 6, 12),
     "laboratory": (1600, 6, 9),
@@ -75,10 +75,6 @@ def room(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def is_effect(path: Path) -> bool:
-    return path.parent.name == "effects" and not path.stem.startswith("_")
-
-
 def imports(path: Path, at_import_only: bool = False) -> set[str]:
     """Dotted names a file imports; `at_import_only` leaves out those inside functions and `if TYPE_CHECKING`."""
     found: set[str] = set()
@@ -113,7 +109,8 @@ def constants(path: Path) -> int:
 def test_every_room_and_the_tests_stay_within_their_budgets():
     size = {name: [0, 0, 0] for name in BUDGETS}
     for path in FILES:
-        if room(path) != "__init__" and not is_effect(path):
+        is_effect = path.parent.name == "effects" and not path.stem.startswith("_")
+        if room(path) != "__init__" and not is_effect:
             lines = path.read_text(encoding="utf-8").count("\n")
             size[room(path)] = [a + b for a, b in zip(size[room(path)], (lines, 1, constants(path)), strict=True)]
     over = {
