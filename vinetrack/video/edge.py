@@ -108,7 +108,7 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
     # too far back, film serves as its own background; without contrast nothing corrects it.
-    contrast = np.median(np.abs(appearance[0] - appearance[1]), axis=0)
+    contrast = np.sort(np.abs(appearance[0] - appearance[1]), axis=0)[appearance.shape[1] // 2]
     columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
     near = (columns > state.edge[0] - 5) & (columns < clear)
     later = (columns >= clear) & (columns < state.edge.max() - 5)
@@ -217,7 +217,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     misfits = np.full(len(candidates), np.inf)
     least = int(np.argmin(np.abs(candidates - state.blur)))
     while not np.isfinite(misfits[max(least - 1, 0) : least + 2]).all():  # down to the least, from the blur until now
-        for k in range(max(least - 1, 0), min(least + 2, len(candidates))):
+        for k in (k for k in range(max(least - 1, 0), min(least + 2, len(candidates))) if np.isinf(misfits[k])):
             # Each with a new fit: a blur must not be judged by edges fitted with another.
             blurred = replace(state, blur=float(candidates[k]))
             fit = fit_edges(strip, blurred, np.isin(np.arange(len(state.edge)), sampled), EARLY_FIT_ROUNDS)
@@ -466,7 +466,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     the one behind the last. A late beginning is better than an early one: neighbours then stand in for the background.
     """
     ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
-    last, first = (np.median(strip.brightness(frames), axis=0) for frames in ends)
+    last, first = (np.sort(strip.brightness(frames), axis=0)[ky.END_FRAMES // 2] for frames in ends)
     # Power of each column's change, of rows averaged in groups, over that of the noise
     # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
     group_size = int(np.clip(len(first) // 12, 1, 4))
@@ -475,8 +475,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
-    looks = (strip.brightness(slice(t, t + 1))[0] for t in range(len(strip.values)))
-    votes = np.stack([((np.abs(look - last) - np.abs(look - first)) * weight).sum(axis=0) for look in looks])
+    votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, weight)
     path = ky.dividing_path(votes)
     # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
     # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
@@ -487,10 +486,14 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    path = _with_run_up(np.clip(path, *passed))
-    blank = np.zeros((4, *first.shape), np.float32)
-    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(len(first)), 2.0, blank)
-    return estimate_appearance(strip, state, 0.0), passed
+    return straight_tip(strip, _with_run_up(np.clip(path, *passed))), passed
+
+
+def straight_tip(strip: Strip, path: Floats) -> EdgeState:
+    """Film and background along a path, for a straight tip and a typical blur. Shapes: path (n_frames,)."""
+    blank = np.zeros((4, *strip.values.shape[1:]), np.float32)
+    state = EdgeState(path, blur_lengths(path, ASSUMED_EXPOSURE), np.zeros(blank.shape[1]), 2.0, blank)
+    return estimate_appearance(strip, state, 0.0)
 
 
 def _with_run_up(path: Floats) -> Floats:
@@ -529,7 +532,7 @@ class EdgeTracker(Tracker):
             if iteration > 0 and np.abs(before - path).max() <= 1.0:
                 break
             state = estimate_appearance(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
-        fit = fit_edges(strip, state, informative_frames(state.edge))
+        fit = fit_edges(strip, state, informative_frames(state.edge), EARLY_FIT_ROUNDS)
         for iteration in range(3 * rounds):
             before = fit[:, 0]
             # Take over the fitted edges, and hold them at rest; blur lengths, film and background follow from them.
@@ -632,8 +635,7 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
 
 
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-# Largest distance from the tube's middle at which a line, which lies on whole rows, and a curve are left (measured)
-CENTRED_LINE_PX, CENTRED_CURVE_PX = 0.8, 0.3
+CENTRED_PX = 1.0  # Largest distance from the tube's middle at which its outline is right (chosen)
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
@@ -643,24 +645,24 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     """
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
-    # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
-    strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
+    strip = cut_strip(luma, axis, 0.65 * axis.width_px + 3, nearest=True)
     parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
     tube = outline(strip, parts)
     try:
         # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
         for _ in range(3):
             moved, distance_px = axis_of_tube(strip.axis, tube)
-            room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
-            centred_px = CENTRED_CURVE_PX if axis.bends else CENTRED_LINE_PX
-            if distance_px < centred_px and 0 <= room_px < 0.3 * tube.half_px + 6:
+            if distance_px < CENTRED_PX and tube.half_px + 2 * CENTRED_PX < strip.values.shape[1] / 2:
                 break
-            strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip)
+            strip = cut_strip(luma, moved, tube.half_px * 1.15 + 5, strip, nearest=True)
             tube = outline(strip, parts)
-        off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
+        moved, _ = axis_of_tube(strip.axis, tube)
+        if front_share(small, moved) < LEAST_FRONT_SHARE:
+            return None
+        strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip)
     except (RecordingError, ValueError):
         return None
-    return None if off_tube else (strip, tube)
+    return strip, replace(tube, state=straight_tip(strip, tube.state.edge))
 
 
 def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:

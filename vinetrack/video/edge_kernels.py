@@ -117,6 +117,25 @@ def film_evidence(
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
+def votes(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
+    """Weighted sum over rows of a pixel's distance from the `last` picture less that from the `first`, by column.
+    Shapes: first, last, weight (n_across, n_along) → (n_frames, n_along).
+    """
+    n, rows, columns = strip.shape
+    out = np.zeros((n, columns), np.float32)
+    for t in range(n):
+        gain, level, scores = np.float32(scale[t]), np.float32(offset[t]), out[t]
+        for u in range(rows):
+            values, begin, end, share = strip[t, u], first[u], last[u], weight[u]
+            for s in range(columns):
+                value = np.float32(values[s]) * gain + level
+                scores[s] += (abs(value - end[s]) - abs(value - begin[s])) * share[s]
+    return out
+
+
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def fit_edges(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, start: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, prior_sd: float, margin: float, rounds: int,

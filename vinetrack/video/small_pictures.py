@@ -72,9 +72,14 @@ class SmallPictures:
         self.frames = small * np.float32(255.0 / max(float(small.max()), 1.0))
 
     @cached_property
+    def _busy(self) -> tuple[NDArray[np.float32], float]:
+        """See `_busy_frames`."""
+        return _busy_frames(self.frames)
+
+    @cached_property
     def changed(self) -> Pixels:
         """All pixels that change."""
-        return changed_pixels(self.frames)
+        return _changed_pixels(*self._busy)
 
     @cached_property
     def grown(self) -> Pixels:
@@ -83,7 +88,7 @@ class SmallPictures:
         """
         if not len(self.changed.x):
             return self.changed
-        frames, noise = _busy_frames(self.frames)
+        frames, noise = self._busy
         rows, columns = self.changed.y.astype(int), self.changed.x.astype(int)
         lasting = _step_fraction(frames[:, rows, columns].astype(float), self.changed.time.astype(int), noise)
         kept = self.changed.where(lasting > 0.8)  # 0.8: part of a pixel's change that the step explains (measured)
@@ -100,7 +105,11 @@ class SmallPictures:
 
 def changed_pixels(small: NDArray[np.float32]) -> Pixels:
     """Find the pixels that change for good, by their largest step. Shapes: small (n_frames, height, width)."""
-    frames, noise_power = _busy_frames(small)
+    return _changed_pixels(*_busy_frames(small))
+
+
+def _changed_pixels(frames: NDArray[np.float32], noise_power: float) -> Pixels:
+    """The same of busy frames and the variance of their noise."""
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
     frame, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))

@@ -95,16 +95,24 @@ class Tracker(Protocol):
         ...
 
 
-def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
+def cut_strip(
+    luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None, nearest: bool = False
+) -> Strip:
     """Cut the strip about an axis, no wider than a curve's normals allow; corrected for flicker and shake as `before`,
-    a strip of the same frames, where that is given. Shapes: luma (n_frames, height, width).
+    a strip of the same frames, where that is given; of the `nearest` pixels, or interpolated. Shapes: luma (n_frames,
+    height, width).
     """
     half = int(np.ceil(min(half_px, max(axis.largest_half_px - 1, 2.0))))
     if before is None:
         scale, offset, shift, stabilised = steadied(luma, axis, half)
     else:
         scale, offset, shift, stabilised = before.scale, before.offset, before.shift_px, before.stabilised
-    values = sample(luma, axis, np.arange(-half, half + 1), shift if stabilised else None)
+    along, across = np.meshgrid(np.arange(int(axis.length_px) + 1.0), np.arange(-half, half + 1.0))
+    places, moved = axis.points(along.ravel(), across.ravel()), shift if stabilised else None
+    # An axis along rows or columns of the picture is cut without interpolation, moved by less than half a pixel.
+    if moved is None and (nearest or (not axis.bends and max(abs(axis.direction)) > 1 - 1e-9)):
+        places = np.rint(places).astype(int)
+    values = _pixels(luma, places, moved, nearest).reshape(len(luma), *along.shape)
     # Noise of a pixel from differences of neighbouring frames, grey levels. Medians over pixels, since motion affects
     # few of them; at least 1, since compression freezes a picture at rest, while moving pixels are never known better.
     step = max(1, len(values) // 40)
@@ -116,35 +124,24 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     return Strip(values, scale, offset, shift, noise, axis, stabilised)
 
 
-def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
-    """Move an axis that lies along rows or columns, except for a small slope over its whole length (0.4 px, chosen),
+def snap_to_grid(axis: Axis) -> Axis:
+    """Move an axis that lies along rows or columns, except for a small slope over its whole length (1.6 px, measured),
     onto whole rows or columns. Cutting then needs no interpolation, and a tenth of the time.
     """
     ends = np.array([axis.from_px, axis.to_px], dtype=float)
     extent = np.abs(ends[1] - ends[0])
     level = int(np.argmin(extent))
-    if axis.bends or extent[level] > tolerance_px or extent[1 - level] <= 10:
+    if axis.bends or extent[level] > 1.6 or extent[1 - level] <= 10:
         return axis
     ends[:, level] = ends[:, level].mean()
     return axis_through(np.rint(ends), axis.width_px)
 
 
-def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:
-    """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
-    along rows or columns of the picture is cut without interpolation, after moving it by less than half a pixel.
-    Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
-    rows_px (n_rows,); shift_px (n_frames, 2) → (n_frames, n_rows, n_along).
-    """
-    along = np.arange(int(np.floor(axis.length_px)) + 1, dtype=float)
-    places = axis.points(along[None, :], rows_px[:, None].astype(float))
-    if shift_px is None and not axis.bends and max(abs(axis.direction)) > 1 - 1e-9:
-        places = np.rint(places).astype(int)
-    return _pixels(luma, places.reshape(-1, 2), shift_px).reshape(len(luma), len(rows_px), len(along))
-
-
-def _pixels(luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | None) -> NDArray[Any]:
-    """Pixels (x, y) of every frame, each moved by its own shift, bicubic; beyond the picture its border is repeated.
-    Whole places without a shift are read as they are. Shapes: places (n_pixels, 2) → (n_frames, n_pixels).
+def _pixels(
+    luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | None, nearest: bool = False
+) -> NDArray[Any]:
+    """Pixels (x, y) of every frame, each moved by its own shift, bicubic or `nearest`; beyond the picture its border is
+    repeated. Whole places without a shift are read as they are. Shapes: places (n_pixels, 2) → (n_frames, n_pixels).
     """
     import cv2
 
@@ -154,10 +151,10 @@ def _pixels(luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | Non
     # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
     rows = np.pad(places, ((0, -len(places) % 1000), (0, 0)), mode="edge").reshape(-1, 1000, 2).astype(np.float32)
     x, y = np.ascontiguousarray(np.moveaxis(rows, 2, 0))
-    out = np.empty((len(luma), *x.shape), luma.dtype)
+    out, how = np.empty((len(luma), *x.shape), luma.dtype), cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
     for frame, cut, (dx, dy) in zip(luma, out, shifts.astype(np.float32), strict=True):
-        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=cut, borderMode=cv2.BORDER_REPLICATE)
+        cv2.remap(frame, x + dx, y + dy, how, dst=cut, borderMode=cv2.BORDER_REPLICATE)
     return out.reshape(len(luma), -1)[:, : len(places)]
 
 
@@ -187,15 +184,13 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     basis = _reference(luma[picks], places, None) if len(places) else np.zeros((4, 0))
     if not basis[0].any():  # no background, or black all over
         return np.full(n, unit), np.zeros(n), shift, shaken
-    fit, sigma = register(luma, places, basis, None)
+    fits, sigmas = register(luma, places, basis, None)
+    fit, shifts = fits[2], fits[:, :, 2:]
     # 0.04, 2.5: smaller shake is not removed, px (chosen), and one of so many standard errors is noise (derived)
-    least_px = np.maximum(0.04, 2.5 * np.median(sigma, axis=0))
-    if (np.median(np.abs(fit[:, 2:]), axis=0) > least_px).any():
-        parts = zip(*(np.array_split(of_pixel, 2) for of_pixel in (places, basis.T)), strict=True)
-        halves = [register(luma, part, of_part.T, None) for part, of_part in parts]
-        if shifts_agree(*((fit_of[:, 2:], sigma_of) for fit_of, sigma_of in halves)):
-            fit, shift = _followed(luma, places, picks)
-            shaken = True
+    least_px = np.maximum(0.04, 2.5 * np.median(sigmas[2], axis=0))
+    if (np.median(np.abs(shifts[2]), axis=0) > least_px).any() and shifts_agree(shifts[:2], sigmas[:2]):
+        fit, shift = _followed(luma, places, picks)
+        shaken = True
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
 
@@ -223,7 +218,7 @@ def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floa
     basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
     # 4: number of registrations, each from the result of the one before (chosen)
     for turn in range(4):
-        fit, _ = register(luma, places, basis, shift if turn else None)
+        fit = register(luma, places, basis, shift if turn else None)[0][2]
         step = np.clip(fit[:, 2:], -largest_step_px, largest_step_px)
         shift = shift + step
         if turn == 0:
@@ -233,18 +228,16 @@ def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floa
     return fit, shift
 
 
-def shifts_agree(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> bool:
+def shifts_agree(shift: Floats, sigma: Floats) -> bool:
     """Decide whether the camera shook: two halves of the background must then show the same shift. A door, a shadow or
-    a mirror image of the tip passes one half after the other. Given are shift and standard error of each, shape
-    (n_frames, 2).
+    a mirror image of the tip passes one half after the other. Shapes: shift, sigma (2, n_frames, 2).
     """
     # Difference of the shifts measured in the two halves of the background, over their sum, below which the
     # camera is taken to have shaken
     half_disagreement = 0.7
-    difference, total = np.hypot(*(first[0] - second[0]).T), np.hypot(*(first[0] + second[0]).T)
+    difference, total = np.hypot(*(shift[0] - shift[1]).T), np.hypot(*(shift[0] + shift[1]).T)
     strongest = difference + total >= np.quantile(difference + total, 0.75)
-    sigma_sum = float(np.median(first[1] + second[1]))
-    limit = max(half_disagreement * float(np.mean(total[strongest])), 2 * sigma_sum)
+    limit = max(half_disagreement * float(np.mean(total[strongest])), 2 * float(np.median(sigma.sum(axis=0))))
     return float(np.mean(difference[strongest])) < limit
 
 
@@ -261,34 +254,38 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
     """Register every frame to the static background by least squares, twice: the second time without outliers (4 sd).
     The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
     zero, and the shift at zero where the background has no texture. Returns gain, level, shift in x and y of every
-    frame, shape (n_frames, 4), and the standard errors of the shift, shape (n_frames, 2). Shapes: luma (n_frames,
-    height, width); places (n_pixels, 2); basis (4, n_pixels); shift_px (n_frames, 2).
+    frame, shape (3, n_frames, 4), and the standard errors of the shift, shape (3, n_frames, 2): by the first half of
+    the pixels, by the second, and by all. Shapes: luma (n_frames, height, width); places (n_pixels, 2); basis (4,
+    n_pixels); shift_px (n_frames, 2).
     """
     level = float(np.abs(basis[0]).mean()) + 1e-9
     ridge = np.diag([0.0, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
     every = slice(None, None, 4)  # pixels of which medians are taken (derived)
-    solution, error = np.zeros((len(luma), 4)), np.full((len(luma), 2), np.inf)
-    typical = max(_median(basis[0, every]), 1e-9)
-    for k, values in enumerate(_pixels(luma, places, shift_px).astype(float)):
-        inlier, used = np.ones(len(values), dtype=bool), basis
-        for turn in range(2):
-            inverse = np.linalg.inv(used @ basis.T + ridge)
-            solution[k] = inverse @ (used @ values)
-            residual = np.abs(values - solution[k] @ basis)
-            scale = 1.4826 * _median(residual[every][inlier[every]]) + 0.3  # with rounding to whole grey levels
-            error[k] = scale * np.sqrt(np.maximum(np.diagonal(inverse)[2:], 0.0))
-            if turn == 0:  # outliers of a change of brightness alone, where that fits better
-                of_gain = np.abs(values - _median(values[every]) / typical * basis[0])
-                gain_scale = 1.4826 * _median(of_gain[every]) + 0.3
-                inlier = of_gain < 4 * gain_scale if gain_scale < scale else residual < 4 * scale
-                if np.count_nonzero(inlier) > 0.99 * inlier.size:
-                    break
-                used = basis * inlier
-    solution[:, 2:] /= np.maximum(solution[:, :1], 0.05)
+    typical = max(float(_medians(basis[:1, every])[0]), 1e-9)
+    products, inverse = (basis[:, None] * basis).reshape(16, -1), np.linalg.inv(basis @ basis.T + ridge)
+    parts = slice(basis.shape[1] // 2), slice(basis.shape[1] // 2, None), slice(None)
+    found = []
+    for k in range(0, len(luma), 32):  # 32: frames at once, few enough for the processor's cache (derived)
+        values = _pixels(luma[k : k + 32], places, None if shift_px is None else shift_px[k : k + 32]).astype(float)
+        residual = np.abs(values - values @ basis.T @ inverse @ basis)
+        scale = 1.4826 * _medians(residual[:, every]) + 0.3  # with rounding to whole grey levels
+        # outliers of a change of brightness alone, where that fits better
+        of_gain = np.abs(values - (_medians(values[:, every]) / typical)[:, None] * basis[0])
+        gain_scale = 1.4826 * _medians(of_gain[:, every]) + 0.3
+        residual[gain_scale < scale] = of_gain[gain_scale < scale]
+        scale = np.minimum(scale, gain_scale)
+        inlier = (residual < 4 * scale[:, None]).astype(float)
+        normal = np.stack([inlier[:, part] @ products[:, part].T for part in parts])
+        right = np.stack([(values * inlier)[:, part] @ basis[:, part].T for part in parts])
+        of_frame = np.linalg.inv(normal.reshape(3, -1, 4, 4) + ridge * np.reshape([0.5, 0.5, 1.0], (3, 1, 1, 1)))
+        error = scale[:, None] * np.sqrt(np.maximum(of_frame[..., [2, 3], [2, 3]], 0.0))
+        found.append(np.concatenate([(of_frame @ right[..., None])[..., 0], error], axis=2))
+    solution, error = np.split(np.concatenate(found, axis=1), [4], axis=2)
+    solution[..., 2:] /= np.maximum(solution[..., :1], 0.05)
     return solution, error
 
 
-def _median(values: NDArray[Any]) -> float:
-    """The median, the upper of two; five times as fast as that of numpy."""
-    middle = values.size // 2
-    return float(np.partition(values, middle)[middle])
+def _medians(values: NDArray[Any]) -> Floats:
+    """The median of every row, the upper of two; five times as fast as that of numpy. Shapes: (n, m) → (n,)."""
+    middle = values.shape[1] // 2
+    return np.asarray(np.partition(values, middle, axis=1)[:, middle])
