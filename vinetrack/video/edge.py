@@ -37,6 +37,7 @@ TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
+AROUND_PX = 64.0  # Distance from the edge's way up to which film and background are asked (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
@@ -72,7 +73,7 @@ def moving_frames(edge: Floats) -> Bools:
     (n_frames,).
     """
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
-    moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
+    moving = speed > max(0.2, 0.1 * np.sort(speed)[int(0.95 * (len(speed) - 1))])
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
@@ -97,6 +98,7 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     passing_px = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
     behind = np.maximum(places + passing_px + float(state.lag.max()), clear_of_start(state.edge))
     early = np.clip(np.interp(places - passing_px, monotone, frames), begin, end)
+    early[(places < state.edge.min() - AROUND_PX) | (places > state.edge.max() + AROUND_PX)] = np.inf
     late = np.clip(np.interp(behind, monotone, frames), begin, end)
     # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
     reach = 0.5 * state.lengths + 2.06 * state.blur
@@ -659,7 +661,8 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
         moved, _ = axis_of_tube(strip.axis, tube)
         if front_share(small, moved) < LEAST_FRONT_SHARE:
             return None
-        strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip)
+        final = snap_to_grid(replace(moved, width_px=tube.width_px))
+        strip = cut_strip(luma, final, tube.half_px * 1.15 + 5, strip)
     except (RecordingError, ValueError):
         return None
     return strip, replace(tube, state=straight_tip(strip, tube.state.edge))
