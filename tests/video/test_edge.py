@@ -186,7 +186,7 @@ def test_travel_is_compared_with_the_length(length_px, complete):
     edge_px = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
     slot = np.arange(edge_px.size)
     quality = PointQuality(np.full(56, "", dtype="<U64"), (), 10, 49, None, np.zeros(56, dtype=bool))
-    ending = ending_of(np.zeros((56, 4, 4), np.uint8), quality, edge_px, "a.mp4", slot, whole=True)
+    ending = ending_of(quality, edge_px, "a.mp4", slot, whole=True)
     assert ending.remark
     assert (ending.notes(length_px) == []) is complete
 

@@ -20,7 +20,7 @@ from vinetrack.core.records import Bools, Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX, SMALLEST_POINT_SPACING_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import collecting_path
-from vinetrack.video.small_pictures import Pixels, SmallPictures, changed_pixels, order_tolerance
+from vinetrack.video.small_pictures import Pixels, SmallPictures, busy_pictures, changed_pixels, order_tolerance
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -241,7 +241,7 @@ def _line_of_beginning(small: SmallPictures, whole: _Line) -> _Line:
     orderly = []
     # Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
     for fraction in (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
-        pixels = changed_pixels(small.frames[: max(3, int(fraction * len(small.frames)))])
+        pixels = changed_pixels(*busy_pictures(small.frames[: max(3, int(fraction * len(small.frames)))]))
         # Of a vine that bends and sweeps, early change counts most; elsewhere a door, which swings first, would too.
         line = _line_through_pairs(small, pixels, pixels.weight * (1 - 0.8 * pixels.time / pixels.n_times))
         orderly += [line] if line.front_share >= LEAST_FRONT_SHARE else []

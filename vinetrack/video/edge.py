@@ -651,14 +651,14 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
     tube = outline(strip, parts)
     try:
+        moved, distance_px = axis_of_tube(strip.axis, tube)
         # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
         for _ in range(3):
-            moved, distance_px = axis_of_tube(strip.axis, tube)
             if distance_px < CENTRED_PX and tube.half_px + 2 * CENTRED_PX < strip.values.shape[1] / 2:
                 break
             strip = cut_strip(luma, moved, tube.half_px * 1.15 + 5, strip, nearest=True)
             tube = outline(strip, parts)
-        moved, _ = axis_of_tube(strip.axis, tube)
+            moved, distance_px = axis_of_tube(strip.axis, tube)
         if front_share(small, moved) < LEAST_FRONT_SHARE:
             return None
         final = snap_to_grid(replace(moved, width_px=tube.width_px))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,12 +141,8 @@ class Ending:
         return [note for note in (self.remark, moves if np.isfinite(self.truncated_px) else "") if note]
 
 
-def ending_of(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool
-) -> Ending:
-    """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: luma (n_frames, height, width);
-    edge_px, number (n_frames,).
-    """
+def ending_of(quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool) -> Ending:
+    """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: edge_px, number (n_frames,)."""
     start, end = edge_px[: quality.first_moving], edge_px[quality.last_moving + 1 :]
     both = np.isfinite(start).any() and np.isfinite(end).any()
     grown_px, truncated_px = float(np.nanmedian(end) - np.nanmedian(start)) if both else math.nan, math.nan
@@ -158,18 +153,8 @@ def ending_of(
     remark, n, last = "", len(edge_px), quality.last_moving
     # 4: fewest frames of standstill at the end that are reported (chosen)
     if 0 <= last < n - 4 and quality.left_picture is None:
-        change = np.abs(np.diff(luma[:, ::5, ::5].astype(np.int32), axis=0)).mean(axis=(1, 2))
-        before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
-        least, later = float(np.min(change)), float(np.median(change[last + 1 :]))
         resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
-        where = f"{name}: the leading edge stops at {np.median(resting) if resting.size else np.nan:.0f} px"
-        where = f"{where} after frame {number[last]}"
-        # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
-        # changing (chosen)
-        if not resting.size:
-            remark = f"{name}: the leading edge is not seen after frame {number[last]}"
-        elif later - least > 0.3 * (before - least):
-            remark = f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"
-        else:
-            remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
+        where = f"stops at {np.median(resting):.0f} px" if resting.size else "is not seen"
+        why = f"{n - 1 - last} frames before the recording ends: grown to its end, held, or off the axis"
+        remark = f"{name}: the leading edge {where} after frame {number[last]}, {why}"
     return Ending(grown_px, truncated_px, remark, name)

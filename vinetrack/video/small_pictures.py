@@ -70,16 +70,12 @@ class SmallPictures:
         gain = np.median(sampled / sampled[len(luma) // 2], axis=(1, 2))
         small /= np.clip(gain, 0.2, 5.0)[:, None, None]
         self.frames = small * np.float32(255.0 / max(float(small.max()), 1.0))
-
-    @cached_property
-    def _busy(self) -> tuple[NDArray[np.float32], float]:
-        """See `_busy_frames`."""
-        return _busy_frames(self.frames)
+        self._busy = busy_pictures(self.frames)
 
     @cached_property
     def changed(self) -> Pixels:
         """All pixels that change."""
-        return _changed_pixels(*self._busy)
+        return changed_pixels(*self._busy)
 
     @cached_property
     def grown(self) -> Pixels:
@@ -103,13 +99,8 @@ class SmallPictures:
         return kept._replace(weight=kept.weight * (0.05 - np.log(np.minimum(share[time], 1.0))))
 
 
-def changed_pixels(small: NDArray[np.float32]) -> Pixels:
-    """Find the pixels that change for good, by their largest step. Shapes: small (n_frames, height, width)."""
-    return _changed_pixels(*_busy_frames(small))
-
-
-def _changed_pixels(frames: NDArray[np.float32], noise_power: float) -> Pixels:
-    """The same of busy frames and the variance of their noise."""
+def changed_pixels(frames: NDArray[np.float32], noise_power: float) -> Pixels:
+    """Find the pixels that change for good, by their largest step, in the `busy_pictures` of a recording."""
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
     frame, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
@@ -120,7 +111,7 @@ def _changed_pixels(frames: NDArray[np.float32], noise_power: float) -> Pixels:
     return Pixels(columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), n)
 
 
-def _busy_frames(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+def busy_pictures(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     """At most MAX_FRAMES busy frames, and the variance of a pixel's noise in them, at least that of quantisation."""
     small = busy_frames(small, MAX_FRAMES)
     changes = np.abs(np.diff(small[:: max(1, len(small) // 30), ::2, ::2], axis=0)).ravel()

@@ -214,16 +214,15 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
 
 def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats]:
     """Register every frame again and again, each time from where it was found: fit and shift."""
-    largest_step_px, converged_px = 1.5, 0.02  # Largest shift of one round, and change that is none (chosen)
     basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
     # 4: number of registrations, each from the result of the one before (chosen)
     for turn in range(4):
         fit = register(luma, places, basis, shift if turn else None)[0][2]
-        step = np.clip(fit[:, 2:], -largest_step_px, largest_step_px)
+        step = np.clip(fit[:, 2:], -1.5, 1.5)  # largest shift of one round, px (chosen)
         shift = shift + step
         if turn == 0:
             basis = _reference(luma[picks], places, shift[picks])  # sharper than that of the shaken pictures
-        elif np.abs(step).max() < converged_px:
+        elif np.abs(step).max() < 0.02:  # px (chosen)
             break
     return fit, shift
 
@@ -232,12 +231,10 @@ def shifts_agree(shift: Floats, sigma: Floats) -> bool:
     """Decide whether the camera shook: two halves of the background must then show the same shift. A door, a shadow or
     a mirror image of the tip passes one half after the other. Shapes: shift, sigma (2, n_frames, 2).
     """
-    # Difference of the shifts measured in the two halves of the background, over their sum, below which the
-    # camera is taken to have shaken
-    half_disagreement = 0.7
     difference, total = np.hypot(*(shift[0] - shift[1]).T), np.hypot(*(shift[0] + shift[1]).T)
     strongest = difference + total >= np.quantile(difference + total, 0.75)
-    limit = max(half_disagreement * float(np.mean(total[strongest])), 2 * float(np.median(sigma.sum(axis=0))))
+    # 0.7: difference of the shifts in the two halves, over their sum, below which the camera shook (chosen)
+    limit = max(0.7 * float(np.mean(total[strongest])), 2 * float(np.median(sigma.sum(axis=0))))
     return float(np.mean(difference[strongest])) < limit
 
 

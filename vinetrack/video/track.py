@@ -203,7 +203,7 @@ def track_pixels(
             raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
         raise RecordingError("nothing moves along the axis", NO_GROWTH, name)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
-    notes, ending = _notes(frames, number, luma, trial, followed, quality, axis_given)
+    notes, ending = _notes(frames, number, trial, followed, quality, axis_given)
     notes += left_out
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
@@ -248,9 +248,8 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
 
 
 def _notes(
-    frames: Frames, number: Indices, luma: NDArray[Any], trial: Trial, followed: Positions, quality: PointQuality,
-    axis_given: bool,
-) -> tuple[list[str], Ending]:  # fmt: skip
+    frames: Frames, number: Indices, trial: Trial, followed: Positions, quality: PointQuality, axis_given: bool
+) -> tuple[list[str], Ending]:
     """Sentences about the track: its points, its end and its axis; and how it ends."""
     name = frames.recording.path.name
     notes, ending = [*frames.notes, *quality.notes], Ending()
@@ -259,7 +258,7 @@ def _notes(
         notes.append(f"{name}: the body {why}; later frames are not used")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == len(frames.slots) - 1
-        ending = ending_of(luma, quality, followed.edge_px, name, number, whole)
+        ending = ending_of(quality, followed.edge_px, name, number, whole)
     axis = followed.strip.axis
     if axis.bends and not axis_given:
         notes.append(
