@@ -98,9 +98,8 @@ class Tracker(Protocol):
 def cut_strip(
     luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None, nearest: bool = False
 ) -> Strip:
-    """Cut the strip about an axis, no wider than a curve's normals allow; corrected for flicker and shake as `before`,
-    a strip of the same frames, where that is given; of the `nearest` pixels, or interpolated. Shapes: luma (n_frames,
-    height, width).
+    """Cut the strip about an axis, no wider than a curve's normals allow, of the `nearest` pixels or interpolated;
+    corrected for flicker and shake as `before`, a strip of the same frames. Shapes: luma (n_frames, height, width).
     """
     half = int(np.ceil(min(half_px, max(axis.largest_half_px - 1, 2.0))))
     if before is None:
@@ -284,5 +283,4 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
 
 def _medians(values: NDArray[Any]) -> Floats:
     """The median of every row, the upper of two; five times as fast as that of numpy. Shapes: (n, m) → (n,)."""
-    middle = values.shape[1] // 2
-    return np.asarray(np.partition(values, middle, axis=1)[:, middle])
+    return np.asarray(np.partition(values, values.shape[1] // 2, axis=1)[:, values.shape[1] // 2])
