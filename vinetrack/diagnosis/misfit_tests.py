@@ -52,8 +52,6 @@ from vinetrack.inference.systematics import systematics_of
 
 NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
-WIDE_RANGE = 10.0  # Ratio of the ends of a plausible range from which values are tried in equal ratios (chosen)
-
 REACH_SIGMAS = 2.0  # Standard errors by which a size may lie beyond a plausible range (chosen)
 
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
@@ -136,15 +134,18 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
 
 def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
     """Shapes of an effect at finite sizes within its plausible range."""
-    low, high = (end - effect.parameters[0].zero for end in plausible_range(effect.parameters[0]))
+    low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
-    fractions: tuple[float, ...] = (0.03, 0.2, 0.7)  # (chosen)
-    if "rest_force" in effect.functions:  # no response to a size below a threshold
-        fractions = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)  # (chosen)
-    elif low > 0 and high / low > WIDE_RANGE:
-        fractions = tuple((np.geomspace(low, high, 5)[1:4] / high).tolist())
-    steps = itertools.product(other_values, fractions)
-    return [CandidateShape(effect, values, fraction * largest, whole=True) for values, fraction in steps]
+    zero = effect.parameters[0].zero
+    # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
+    # infinitesimal size (chosen)
+    with_threshold = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+    fractions = with_threshold if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
+    return [
+        CandidateShape(effect, values, fraction * (largest - zero), whole=True)
+        for values in other_values
+        for fraction in fractions
+    ]
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
@@ -161,7 +162,8 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     if parameter.tried:
         return parameter.tried
     low, high = plausible_range(parameter)
-    if low > 0 and high / low > WIDE_RANGE:
+    # 10.0: ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
+    if low > 0 and high / low > 10.0:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
     if low > 0 and high / low < NARROW_RANGE:
         return ((low + high) / 2,)
