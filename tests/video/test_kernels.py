@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from vinetrack.video import edge_kernels as kernels
+from vinetrack.video.axis import axis_through
+from vinetrack.video.strip import steadied
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
 RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
@@ -51,3 +53,10 @@ def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and
     run = [sys.executable, "-c", FITS]
     first, later = (subprocess.run(run, env=os.environ | where, capture_output=True, check=True) for _ in range(2))
     assert first.stdout == later.stdout
+
+
+def test_a_background_that_is_black_along_half_of_the_growth_is_no_flicker():
+    picture = np.random.default_rng(1).integers(20, 200, (80, 160)).astype(np.uint8)
+    picture[:, :100] = 0
+    scale = steadied(np.stack([picture] * 6), axis_through(((10, 40), (150, 40)), 6.0), 5)[0]
+    np.testing.assert_allclose(scale, 1.0, atol=1e-3)

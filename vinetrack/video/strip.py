@@ -249,15 +249,15 @@ def _reference(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> 
 def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Floats | None) -> tuple[Floats, Floats]:
     """Register every frame to the static background by least squares, twice: the second time without outliers (4 sd).
     The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
-    zero, and the shift at zero where the background has no texture. Returns gain, level, shift in x and y of every
-    frame, shape (3, n_frames, 4), and the standard errors of the shift, shape (3, n_frames, 2): by the first half of
-    the pixels, by the second, and by all. Shapes: luma (n_frames, height, width); places (n_pixels, 2); basis (4,
-    n_pixels); shift_px (n_frames, 2).
+    zero, the shift where the background has no texture, and the gain where it is black. Returns gain, level, shift in x
+    and y of every frame, shape (3, n_frames, 4), and the standard errors of the shift, shape (3, n_frames, 2): by the
+    first half of the pixels, by the second, and by all. Shapes: luma (n_frames, height, width); places (n_pixels, 2);
+    basis (4, n_pixels); shift_px (n_frames, 2).
     """
     level = float(np.abs(basis[0]).mean()) + 1e-9
-    ridge = np.diag([0.0, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
-    every = slice(None, None, 4)  # pixels of which medians are taken (derived)
-    typical = max(float(_medians(basis[:1, every])[0]), 1e-9)
+    ridge = np.diag([1e-6 * level**2, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
+    every = np.flatnonzero(basis[0] > 0)[::4]  # pixels of which medians are taken: black ones tell no gain (derived)
+    typical = float(_medians(basis[:1, every])[0])
     products, inverse = (basis[:, None] * basis).reshape(16, -1), np.linalg.inv(basis @ basis.T + ridge)
     parts = slice(basis.shape[1] // 2), slice(basis.shape[1] // 2, None), slice(None)
     found = []
