@@ -1,6 +1,7 @@
 """Recordings made by others, read from the folder that VINETRACK_REAL_DATA names; skipped where it is unset."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +51,9 @@ def test_growing_vine_is_followed_to_the_wall(real, given):
     if isinstance(given, str):
         assert np.nanmin(x) < 55
         assert np.nanmax(x) > 210
-        assert any("it met a wall" in note for note in tracking.track.notes)
+        stops = re.search(r"stops at (\d+) px after frame (\d+)", " ".join(tracking.track.notes))
+        assert abs(int(stops[1]) - np.nanmax(tracking.track.edge_px)) < 5
+        assert 140 < int(stops[2]) < 170
 
 
 def cup(real: Path, number: int, width_px: float) -> Track:
