@@ -66,6 +66,7 @@ def row_of(said: result.Diagnosis, effect: str) -> result.Candidate:
         ("null:large_B_scatter", 913, {"adequate"}),
         ("tail_friction", 918, {"missing", "ambiguous"}),
         ("reservoir_depletion", 905, {"missing", "ambiguous"}),
+        ("supply_refill", 94001, {"missing", "ambiguous"}),
         ("outsider:rough_patch", 962, {"unexplained"}),
     ],
 )

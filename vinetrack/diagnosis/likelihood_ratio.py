@@ -86,6 +86,10 @@ class LikelihoodRatio:
     def _adds(self, number: Number) -> bool:
         return number.key.split(".")[0] in self.names or number.key in self.split
 
+    def contains(self, other: LikelihoodRatio) -> bool:
+        """Whether another hypothesis is a limit of this one, which fits as well by construction."""
+        return any(name in other.names for effect in self.effects for name in effect.replaces)
+
     def deviance_excess(self, other: LikelihoodRatio) -> float:
         """−2 ln L of this hypothesis minus that of another."""
         return 2 * (other.fit.log_likelihood - self.fit.log_likelihood)
@@ -210,11 +214,10 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     rejected = {ratio.label: ratio.reason for ratio in likely if ratio not in plausible}
     members = []
     for ratio in plausible:
-        limits = {name for effect in ratio.effects for name in effect.replaces}
         simpler = [
             other
             for other in plausible
-            if limits & set(other.names)
+            if ratio.contains(other)
             and other.n_parameters < ratio.n_parameters
             and other.deviance_excess(ratio) <= reach
         ]

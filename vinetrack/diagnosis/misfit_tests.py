@@ -134,18 +134,17 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
 
 def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
     """Shapes of an effect at finite sizes within its plausible range."""
-    low, high = plausible_range(effect.parameters[0])
-    largest = high if abs(high) >= abs(low) else low
-    zero = effect.parameters[0].zero
+    size = effect.parameters[0]
+    low, high = plausible_range(size)
     # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
     # infinitesimal size (chosen)
     with_threshold = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
-    fractions = with_threshold if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
-    return [
-        CandidateShape(effect, values, fraction * (largest - zero), whole=True)
-        for values in other_values
-        for fraction in fractions
-    ]
+    has_threshold = "rest_force" in effect.functions
+    largest = high if abs(high) >= abs(low) else low
+    steps = [fraction * (largest - size.zero) for fraction in (with_threshold if has_threshold else (0.03, 0.2, 0.7))]
+    if _spans_decades(size) and not has_threshold:
+        steps = [value - size.zero for value in _typical_values(size)]
+    return [CandidateShape(effect, values, step, whole=True) for values in other_values for step in steps]
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
@@ -157,13 +156,19 @@ def plausible_range(parameter: Parameter) -> tuple[float, float]:
     return max(low, parameter.zero - reach), min(high, parameter.zero + reach)
 
 
+def _spans_decades(parameter: Parameter) -> bool:
+    """Whether values that span its plausible range lie in equal ratios."""
+    low, high = plausible_range(parameter)
+    # 10.0: ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
+    return low > 0 and high / low > 10.0
+
+
 def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     """Values that the effect names; else three that span the plausible range, or its middle where that is narrow."""
     if parameter.tried:
         return parameter.tried
     low, high = plausible_range(parameter)
-    # 10.0: ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
-    if low > 0 and high / low > 10.0:
+    if _spans_decades(parameter):
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
     if low > 0 and high / low < NARROW_RANGE:
         return ((low + high) / 2,)

@@ -279,7 +279,7 @@ def adequate_hypotheses(
     """
     _, rejected = answer_set(hypotheses)
     best, by_likelihood = best_of(hypotheses), sorted(hypotheses, key=lambda ratio: -ratio.fit.log_likelihood)
-    beyond_belief = max((ratio.fit.log_likelihood for ratio in hypotheses if not ratio.credible), default=-math.inf)
+    beyond_belief = [ratio for ratio in hypotheses if not ratio.credible]
     adequate: list[LikelihoodRatio] = []
     after: MisfitTests | None = None
     for hypothesis in by_likelihood:
@@ -287,8 +287,10 @@ def adequate_hypotheses(
             continue
         if hypothesis not in answer_set([*adequate, hypothesis])[0]:
             continue
-        # A size outside its plausible range is believed where nothing beyond belief fits better.
-        if not hypothesis.credible or (not hypothesis.plausible and hypothesis.fit.log_likelihood < beyond_belief):
+        # A size outside its plausible range is believed where nothing beyond belief fits better, but what contains it.
+        others = [other for other in beyond_belief if not other.contains(hypothesis)]
+        fits_best = all(other.deviance_excess(hypothesis) >= 0 for other in others)
+        if not hypothesis.credible or not (hypothesis.plausible or fits_best):
             rejected[hypothesis.label] = hypothesis.reason
             continue
         tests = search.tests_after(hypothesis.fit)
