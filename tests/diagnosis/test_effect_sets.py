@@ -191,7 +191,8 @@ def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_part
     assert one_not_asked.effects == one_not_asked.answer_set == ()
     assert one_not_asked.missing_force is not None
     steps, ladder = [step.effect for step in one_not_asked.rounds[0].partial], one_not_asked.ladder
-    assert all((len(one_not_asked.force.table), len(one_not_asked.force.learned.table), steps))
+    assert len(one_not_asked.force.learned.table)
+    assert steps
     assert tuple(ladder.columns) == LADDER_COLUMNS
     assert ladder["partial"].tolist() == [False, *[True] * len(steps)]
     assert ladder["added"].tolist() == ["", *steps]

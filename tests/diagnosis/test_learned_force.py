@@ -169,8 +169,7 @@ def test_a_rough_patch_is_learned_where_it_is_in_every_condition_and_is_no_simpl
     patch = missing_from(tmp_path, "patch", -0.4, 91)
     assert patch.sentence.code in ("like_no_law", "no_law_agreed_on")
     assert patch.learned.domain.variables == ("growth",)
-    assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
-    along = patch.table[patch.table["condition"] != ""]
+    along = patch.learned.table[patch.learned.table["condition"] != ""]
     assert along[["lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"]].notna().all(axis=None)
     for _, one in along.groupby("condition"):
         lowest = one.loc[one["force_N"].idxmin()]
@@ -187,7 +186,7 @@ def test_nothing_is_learned_about_tracks_along_which_the_model_is_unstable():
 
 @pytest.mark.slow
 def test_a_friction_that_falls_with_speed_depends_on_speed(tmp_path):
-    assert missing_from(tmp_path, "stribeck", -1.5, 93).depends_on["speed"] > 0.9
+    assert missing_from(tmp_path, "stribeck", -1.5, 93).learned.domain.variables == ("speed",)
 
 
 def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):

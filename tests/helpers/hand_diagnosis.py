@@ -75,7 +75,7 @@ def refused(reason: str = "fewer than two trials move") -> dict:
 
 def missing_force() -> dict:
     law = {"law": "constant", "words": "the same everywhere", "explained": 0.93, "amplitude_N": 0.4, "sigma_N": 0.02}
-    return {"sentence": "It looks like a constant.", "laws": [law], "depends_on": {"growth": 0.95}}
+    return {"sentence": "It looks like a constant.", "laws": [law]}
 
 
 def next_experiment() -> dict:

@@ -172,49 +172,6 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     return domains
 
 
-@dataclass(frozen=True)
-class SmoothForce:
-    """A force over some variables: the posterior of its coefficients, N, and the motions of the trials under it."""
-
-    domain: Domain
-    found: Posterior
-    motions: Sequence[FittedMotion]
-
-    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
-        basis = self.domain.basis(values)
-        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The force on a grid of its variables (condition blank), with the number of trials that visited each point,
-        and along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
-        """
-        import pandas as pd
-
-        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-        axes, names = self.domain.axes, [VARIABLES[name] for name in self.domain.variables]
-        ends = [np.linspace(axis.low, axis.high, plot_points[len(axes) - 1]) for axis in axes]
-        grid = [values.ravel() for values in np.meshgrid(*ends, indexing="ij")]
-        trials = np.zeros(grid[0].size, dtype=int)
-        parts = {"": dict(zip(names, grid, strict=True))}
-        for motion in self.motions:
-            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
-            for axis, at, course in zip(axes, grid, self.domain.values_along(motion), strict=True):
-                near &= np.abs(axis.part(at)[:, None] - axis.part(course)) < visited_distance
-            trials += near.any(axis=1)
-            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
-            along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
-            parts.setdefault(motion.trial.condition, along)
-        tables = []
-        for condition, values in parts.items():
-            force_N, sigma_N = self.force([values[name] for name in names])
-            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
-            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
-            tables.append(pd.DataFrame(columns | {"condition": condition}))
-        return pd.concat(tables, ignore_index=True)
-
-
 # ------------------------------------------------------------------------------
 # The choice of variables. Where speeds are steady, growth, speed and time are hardly three separate variables: a
 # surface over two of them can be written over another two, and weights compare only how smooth the surfaces are, which
@@ -227,9 +184,13 @@ LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is es
 
 
 @dataclass(frozen=True)
-class Choice(SmoothForce):
-    """A force over some variables, the equations of its coefficients, and their least squares whether smooth or not."""
+class Choice:
+    """A force over some variables: the posterior of its coefficients, N, their equations, and their least squares
+    whether smooth or not.
+    """
 
+    domain: Domain
+    found: Posterior
     equations: ForceEquations
     best: ForceEstimate
 
@@ -246,7 +207,7 @@ def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
     best = [each.estimate() for each in equations]
     inflation = problem.inflation(min(e.chi2 - b.delta_chi2 for e, b in zip(equations, best, strict=True)))
     return [
-        Choice(domain, coefficients_of(domain, each, inflation), point.motions, each, estimate)
+        Choice(domain, coefficients_of(domain, each, inflation), each, estimate)
         for domain, each, estimate in zip(domains, equations, best, strict=True)
     ]
 
@@ -281,13 +242,52 @@ def variable_weights(log_evidence: Mapping[str, float], unit: float = 1.0) -> di
 
 
 @dataclass(frozen=True)
-class LearnedForce(SmoothForce):
-    """The missing force over the variables that it most likely depends on."""
+class LearnedForce:
+    """The missing force over the variables that it most likely depends on: the posterior of its coefficients, N, and
+    the motions of the trials under it.
+    """
 
+    domain: Domain
+    found: Posterior
+    motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
     not_excluded: tuple[str, ...]
     explained: float
     is_repeated: bool
+
+    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.domain.basis(values)
+        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The force on a grid of its variables (condition blank), with the number of trials that visited each point,
+        and along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
+        """
+        import pandas as pd
+
+        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+        axes, names = self.domain.axes, [VARIABLES[name] for name in self.domain.variables]
+        ends = [np.linspace(axis.low, axis.high, plot_points[len(axes) - 1]) for axis in axes]
+        grid = [values.ravel() for values in np.meshgrid(*ends, indexing="ij")]
+        trials = np.zeros(grid[0].size, dtype=int)
+        parts = {"": dict(zip(names, grid, strict=True))}
+        for motion in self.motions:
+            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+            for axis, at, course in zip(axes, grid, self.domain.values_along(motion), strict=True):
+                near &= np.abs(axis.part(at)[:, None] - axis.part(course)) < visited_distance
+            trials += near.any(axis=1)
+            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+            along = {name: np.asarray(getattr(motion, name))[points] for name in VARIABLES.values()}
+            parts.setdefault(motion.trial.condition, along)
+        tables = []
+        for condition, values in parts.items():
+            force_N, sigma_N = self.force([values[name] for name in names])
+            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan) | values
+            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+            tables.append(pd.DataFrame(columns | {"condition": condition}))
+        return pd.concat(tables, ignore_index=True)
 
     @property
     def visited(self) -> pd.DataFrame:
@@ -347,7 +347,7 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
     return LearnedForce(
         domain=domain,
         found=best.found,
-        motions=best.motions,
+        motions=equations.point.motions,
         weights=weights,
         not_excluded=tuple(others),
         explained=min(explained, 1.0),
@@ -504,21 +504,22 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 @dataclass(frozen=True)
 class MissingForce:
-    """What is missing, as a force on the tail, N. `table` is that of its most likely variables."""
+    """What is missing, as a force on the tail: the simple laws, best first, and what was learned."""
 
-    table: pd.DataFrame
-    laws: pd.DataFrame
-    depends_on: Mapping[str, float]
+    laws: Sequence[RankedLaw]
     sentence: Remark
-    detected: tuple[RankedLaw, ...] = ()
     learned: LearnedForce | None = None
+
+    @property
+    def detected(self) -> list[RankedLaw]:
+        """The laws that differ from zero."""
+        return [law for law in self.laws if law.is_detected]
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
             "sentence": str(self.sentence),
-            "laws": self.laws.head(6).to_dict("records"),
-            "depends_on": dict(self.depends_on),
+            "laws": [law.row for law in self.laws[:6]],
             "learned": None if self.learned is None else self.learned.to_json(),
         }
 
@@ -526,8 +527,6 @@ class MissingForce:
 @in_one_blas_thread
 def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
-    import pandas as pd
-
     problem = ForceProblem(fit)
     first = choices = choices_seen_from(problem, problem.start)
     learned = None
@@ -537,26 +536,16 @@ def missing_force(fit: Fit) -> MissingForce:
     choices = min(first, choices, key=_least_chi2)
     point, chi2 = choices[0].equations.point, choices[0].equations.chi2
     laws = ranked_laws(problem, point, chi2, chi2 - _least_chi2(choices))
-    smooth = {choice.domain.name: choice.best.delta_chi2_beyond_chance for choice in choices}
     in_laws = [law.estimate.delta_chi2_beyond_chance for law in laws]
-    explicable = max(1e-300, *smooth.values(), *in_laws)
+    explicable = max(1e-300, *in_laws, *(choice.best.delta_chi2_beyond_chance for choice in choices))
     laws = [replace(law, explained=part / explicable) for law, part in zip(laws, in_laws, strict=True)]
-    depends_on = {name: part / explicable for name, part in smooth.items() if "+" not in name}
     beyond_noise = chi2 - problem.n_points
     # NaN where the misfit hardly exceeds the noise
     reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
-    drawn = learned or max(choices, key=lambda choice: choice.found.log_evidence)
-    return MissingForce(
-        table=drawn.table,
-        laws=pd.DataFrame([law.row for law in laws]),
-        depends_on=depends_on,
-        sentence=_remark(laws, depends_on, reduction),
-        detected=tuple(law for law in laws if law.is_detected),
-        learned=learned,
-    )
+    return MissingForce(laws, _remark(laws, reduction), learned)
 
 
-def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> Remark:
+def _remark(laws: Sequence[RankedLaw], misfit_reduction: float) -> Remark:
     """What the missing force looks like."""
     best = laws[0]
     if misfit_reduction < LEAST_MISFIT_REDUCTION:
@@ -565,9 +554,7 @@ def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_r
         return remark("no_law_agreed_on" if math.isfinite(misfit_reduction) else "no_further_force")
     told = {"law": best.words, "explained": best.explained}
     if best.explained < LEAST_EXPLAINED_TO_NAME:
-        variable = max(depends_on, key=depends_on.__getitem__)
-        alone = depends_on[variable] if depends_on[variable] >= LEAST_EXPLAINED_TO_NAME else 0.0
-        return remark("like_no_law", **told, variable=variable, alone=alone)
+        return remark("like_no_law", **told)
     # Misfit that not even a free force takes away limits how well laws can be told apart.
     # 0.05: difference of the explained parts within which other laws are named with the best (chosen)
     margin = 0.05 + float(np.nan_to_num(1 - misfit_reduction))

@@ -219,10 +219,8 @@ def _laws(diagnosis: Diagnosis, motions: list[TrialMotion], settings: RunSetting
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Return the tables of the initial model's misfit and of the missing force, by file name."""
     tables: dict[str, pd.DataFrame] = {}
-    if (force := diagnosis.force) is not None:
-        tables["missing_force.csv"] = force.table
-        if force.learned is not None:
-            tables["learned_force.csv"] = force.learned.table
+    if diagnosis.force is not None and diagnosis.force.learned is not None:
+        tables["learned_force.csv"] = diagnosis.force.learned.table
     if (failure := diagnosis.failure) is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
