@@ -202,10 +202,12 @@ def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
 def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = per_trial_estimates(found, align_trials(found))
+    aligned = align_trials(found)
+    values = per_trial_estimates(found, aligned)
+    base = aligned.predictor.layout.base[:, found.model.parameter_names.index(B)]
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
-    away = np.array(np.log(values["base"] / true) + values["deviation"])
+    away = np.array(np.log(base / true) + values["deviation"])
     vines = np.array([trial.vine for trial in values["trial"]])
     for vine in set(vines):
         away[vines == vine] -= away[vines == vine].mean()

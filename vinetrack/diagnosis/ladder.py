@@ -457,7 +457,6 @@ LADDER_COLUMNS = (
     *("model", "added", "rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m"),
     *(*EXPECTED, "partial"),
 )
-MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
 MAX_FOLDS = 10  # Maximum number of folds of the cross-validation (chosen)
 
@@ -570,15 +569,3 @@ def _combined(parts: Sequence[Errors]) -> Errors:
         tuple(trial for part in parts for trial in part.trials),
         {name: why for part in parts for name, why in part.not_predicted.items()},
     )
-
-
-def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
-    """Table of the parameters of every model of the ladder, columns `MOVED_COLUMNS`, SI."""
-    import pandas as pd
-
-    rows = [
-        {"model": "+".join(fit.model.names), "added": name, **number.to_json()}
-        for fit, name in zip(fits, added, strict=True)
-        for number in fit.numbers
-    ]
-    return pd.DataFrame(rows, columns=list(MOVED_COLUMNS))

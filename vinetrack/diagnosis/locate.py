@@ -118,13 +118,9 @@ def _condition_row(
         "condition": trial.condition,
         "pressure_Pa": trial.pressure_Pa,
         "payload_kg": trial.payload_kg,
-        "n_trials": len(courses),
         "rms_m": errors["rms_position_m"],
         "floor_m": errors["replicate_floor_m"],
-        "ratio": errors["ratio"],
         "z": float(norm.isf(max(p, 1e-300))),
-        "worst_at_s": errors["worst_at_s"],
-        "worst_at_m": errors["worst_at_m"],
         "worst_residual_m": float(worst["mean_residual_m"]),
         "worst_sigma_m": float(worst["sigma_m"]),
     }
@@ -172,13 +168,10 @@ LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scat
 COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
 
 DRIFT_COLUMNS = (
-    *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
-    *("z", "dof", "n_trials", "significant", "sentence"),
+    *("parameter", "vine", "symbol", "against", "from_level", "to_level", "change", "change_sigma", "z"),
+    *("significant", "sentence"),
 )
-GROUP_COLUMNS = (
-    *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
-    "n_trials",
-)
+GROUP_COLUMNS = ("parameter", "vine", "symbol", "against", "level", "ratio", "ratio_sigma", "n_trials")
 
 
 @dataclass(frozen=True)
@@ -238,9 +231,7 @@ def _tested(
     levels: tuple[float, float],
     change: tuple[float, float],
     p: float,
-    dof: float,
-    n_trials: int,
-    groups: Sequence[tuple[float, ...]] = (),
+    groups: Sequence[Row] = (),
     **told: Any,
 ) -> Row:
     """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
@@ -248,12 +239,10 @@ def _tested(
     """
     from scipy.stats import norm
 
-    subject = (number.key, vine, number.symbol, number.unit, against)
-    numbers = (*levels, *change, float(norm.isf(max(p, 1e-300) / 2)), dof, n_trials)
-    row: Row = dict(zip(DRIFT_COLUMNS, (*subject, *numbers), strict=False))
+    subject: Row = {"parameter": number.key, "vine": vine, "symbol": number.symbol, "against": against}
+    row = subject | dict(zip(DRIFT_COLUMNS[4:], (*levels, *change, float(norm.isf(max(p, 1e-300) / 2))), strict=False))
     sentence = remark("drifts", row=row, pressure_unit=number.pressure_unit, **told)
-    of_groups = [dict(zip(GROUP_COLUMNS, (*subject, *group), strict=True)) for group in groups]
-    return row | {"sentence": sentence, "p": p, "groups": of_groups}
+    return row | {"sentence": sentence, "p": p, "groups": [subject | group for group in groups]}
 
 
 # ------------------------------------------------------------------------------
@@ -263,14 +252,14 @@ def _tested(
 
 def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> pd.DataFrame:
     """Ln B of each trial that depends on it, by least squares of position with its release free: the trial, its vine
-    (blank where all have one B), the common value (`base`), the `deviation` of the best ln B from that, and its
-    `weight`, the inverse of its variance by a typical scatter of pressure and B, up to a factor.
+    (blank where all have one B), the `deviation` of the best ln B from the common value, and its `weight`, the inverse
+    of its variance by a typical scatter of pressure and B, up to a factor.
     """
     import pandas as pd
 
     has_own = any(number.vine for number in fit.numbers if number.key == DAMPING)
-    bases, rows = aligned.predictor.layout.base[:, fit.model.parameter_names.index(DAMPING)], list[tuple[object, ...]]()
-    for i, (trial_data, columns, base) in enumerate(zip(aligned.predictor.data, aligned.columns, bases, strict=True)):
+    rows = list[tuple[object, ...]]()
+    for i, (trial_data, columns) in enumerate(zip(aligned.predictor.data, aligned.columns, strict=True)):
         trial, others = trial_data.trial, columns[:, aligned.nuisances(i)]
         sensitivity = orthogonal_part(columns[:, DAMPING_DEVIATION], others)
         response = float(np.sum(sensitivity**2))
@@ -279,8 +268,8 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> pd.DataFrame:
             levers = sensitivity @ orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], others) / response
             variance = np.sum(np.square(TYPICAL_SPREADS * levers)) + trial_data.mean_noise_m**2 / response + 1e-12
             vine = trial.vine if has_own else ""
-            rows.append((trial, vine, trial.condition, base, sensitivity @ columns[:, -1] / response, 1 / variance))
-    return pd.DataFrame(rows, columns=["trial", "vine", "condition", "base", "deviation", "weight"])
+            rows.append((trial, vine, trial.condition, sensitivity @ columns[:, -1] / response, 1 / variance))
+    return pd.DataFrame(rows, columns=["trial", "vine", "condition", "deviation", "weight"])
 
 
 def _against(of_trials: pd.DataFrame, number: Number, against: str) -> Iterator[Row]:
@@ -307,16 +296,15 @@ def _against(of_trials: pd.DataFrame, number: Number, against: str) -> Iterator[
         variance = float(np.sum(of_trials["weight"] * apart**2) if replicates >= FEWEST_DEGREES else by_slope) / dof
         variance = max(variance, LEAST_SCATTER**2)
         sigma = math.sqrt(variance / square)
-        groups = []
+        groups: list[Row] = []
         for level, alike in tested.groupby("level") if n_vines == 1 else ():
-            bases, error = alike["base"].to_numpy(), math.sqrt(variance / float(alike["weight"].sum()))
-            base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
             ratio = math.exp(float(np.average(alike["deviation"], weights=alike["weight"])))
-            groups.append((level, base * ratio, base * ratio * error, ratio, ratio * error, len(alike)))
+            error = ratio * math.sqrt(variance / float(alike["weight"].sum()))
+            groups.append({"level": level, "ratio": ratio, "ratio_sigma": error, "n_trials": len(alike)})
         reach, ends = float(np.ptp(tested["x"])), (float(tested["level"].min()), float(tested["level"].max()))
         # Relative change from the smaller value, with its standard error
         larger, p = math.exp(abs(slope) * reach), float(2 * student.sf(abs(slope) / sigma, dof))
-        of_test = (ends if slope >= 0 else ends[::-1], (larger - 1, larger * sigma * reach), p, dof, d.size, groups)
+        of_test = (ends if slope >= 0 else ends[::-1], (larger - 1, larger * sigma * reach), p, groups)
         yield _tested(number, vines[0] if n_vines == 1 else "", against, *of_test)
 
 
@@ -333,6 +321,5 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
             continue
         pulled_Pa, sigma_Pa = number.value - free.start, math.sqrt(variance)
         p = math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2))
-        n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
-        of_test = (free.start, number.value), (pulled_Pa, sigma_Pa), p, math.inf, n_trials
+        of_test = (free.start, number.value), (pulled_Pa, sigma_Pa), p
         yield _tested(number, number.vine, "sheet", *of_test, stated_sigma_Pa=free.prior_sd)

@@ -21,12 +21,10 @@ from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
-    MOVED_COLUMNS,
     candidates_of,
     compare,
     in_sample,
     initial_fit,
-    moved,
 )
 from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import propose
@@ -188,11 +186,10 @@ def write_diagnosis(
     extended.
     """
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
-    tables = {"moved.csv": table_of(MOVED_COLUMNS), "damping_laws.csv": table_of(LAW_COLUMNS)}
-    tables |= {**diagnosis_tables(diagnosis), "steps.csv": all_steps(results, ladder)}
+    tables = {"damping_laws.csv": table_of(LAW_COLUMNS), "steps.csv": all_steps(results, ladder)}
+    tables |= diagnosis_tables(diagnosis)
     folder = _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
-        tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
         tables["damping_laws.csv"] = _laws(diagnosis, motions(), settings)
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
@@ -223,7 +220,6 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         tables["learned_force.csv"] = diagnosis.force.learned.table
     if (failure := diagnosis.failure) is not None:
         tables |= {
-            "conditions.csv": failure.by_condition,
             "along_position.csv": failure.along_position,
             "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
