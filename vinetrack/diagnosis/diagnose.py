@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,11 +17,14 @@ from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
+from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.locate import locate
 from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
+from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -152,6 +154,8 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     best_shapes = [tests.ranked_shapes(name)[0] for name in names]
     cosines = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
     sets = tuple(hypothesis.names for hypothesis in step.answer_set)
+    partial_fits = tuple(hypothesis.fit for hypothesis in step.partial)
+    partial = zip((tests.fit, *partial_fits), step.partial, strict=False)  # each with the fit before it
     return Round(
         model=tests.fit.model.names,
         verdict=step.verdict,
@@ -167,25 +171,15 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
             if hypothesis.effects[-1].kind != BETWEEN_TRIALS
         },
         sets=sets if any(len(effects) > 1 for effects in sets) else (),
-        partial=_partial_candidates(step),
-        partial_fits=tuple(hypothesis.fit for hypothesis in step.partial),
+        partial=tuple(_refitted(likelihood_ratio(before, one.effects[-1:], one.fit)) for before, one in partial),
+        partial_fits=partial_fits,
     )
 
 
-def _refitted(hypothesis: LikelihoodRatio, effect: Effect, **more: Any) -> Candidate:
-    """The row of a fitted hypothesis, named after one of its effects."""
-    known = (hypothesis.delta_chi2, hypothesis.sigma, hypothesis.numbers, hypothesis.plausible)
+def _refitted(single: LikelihoodRatio, **more: Any) -> Candidate:
+    """The row of a fitted effect."""
+    effect, known = single.effects[0], (single.delta_chi2, single.sigma, single.numbers, single.plausible)
     return Candidate(effect.name, effect.kind, REFITTED, *known, **more)
-
-
-def _partial_candidates(step: SelectionStep) -> tuple[Candidate, ...]:
-    """The partial steps, each compared with the one before it."""
-    candidates, before = [], step.tests.fit
-    for hypothesis in step.partial:
-        effect = hypothesis.effects[-1]
-        candidates.append(_refitted(likelihood_ratio(before, (effect,), hypothesis.fit), effect))
-        before = hypothesis.fit
-    return tuple(candidates)
 
 
 def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Candidate]:
@@ -200,7 +194,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         in_answer_set = name in step.answer_names
         row = _refitted(
             single,
-            single.effects[0],
             in_answer_set=in_answer_set,
             reason=rejected.get(name, single.reason),
             along=single.others if in_answer_set else (),
@@ -264,11 +257,15 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report, ladde
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:
         tied.insert(0, last.fit)
     are_tied = last.verdict in (AMBIGUOUS, ARTEFACT) and len(tied) > 1
+
+    def with_next(known: Diagnosis) -> Diagnosis:
+        return replace(known, next_experiment=next_experiment(tied, limits).to_json())
+
     for is_wanted, what, code, added in (
         (ladder, "errors before and after", "no_ladder", _with_ladder),
         (advice and result.verdict != ADEQUATE, "where it fails", "not_located", _located),
         (advice and is_unexplained, "computing the missing force", "no_missing_force", _with_missing_force),
-        (advice and are_tied, "looking for the next experiment", "no_next_experiment", partial(_next, tied, limits)),
+        (advice and are_tied, "looking for the next experiment", "no_next_experiment", with_next),
     ):
         if is_wanted:
             report(what)
@@ -279,17 +276,8 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report, ladde
     return result
 
 
-def _next(tied: Sequence[Fit], limits: Limits | None, result: Diagnosis) -> Diagnosis:
-    """Add the next experiment."""
-    from vinetrack.diagnosis.further_trials import next_experiment
-
-    return replace(result, next_experiment=next_experiment(tied, limits).to_json())
-
-
 def _located(result: Diagnosis) -> Diagnosis:
     """Add where the first model fails, and which of its parameters drift."""
-    from vinetrack.diagnosis.locate import locate
-
     failure = locate(result.fits[0])
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
     return replace(result, failure=failure, where=tuple(failure.remarks()), drift=drift)
@@ -297,8 +285,6 @@ def _located(result: Diagnosis) -> Diagnosis:
 
 def _with_missing_force(result: Diagnosis) -> Diagnosis:
     """Add the force that the first model lacks, and the simple law that it resembles."""
-    from vinetrack.diagnosis.missing_force import missing_force
-
     force = missing_force(result.fits[0])
     told = (force.sentence, *([force.learned.sentence] if force.learned else []))
     explanation = " ".join(map(str, (result.explanation, *told)))

@@ -15,13 +15,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PlainSerializer
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
+from vinetrack.core.tables import JsonRecord
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
@@ -131,27 +133,19 @@ NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all o
 
 
 @dataclass(frozen=True)
-class NextExperiment:
+class NextExperiment(JsonRecord):
     """The recommended next trials. `trials` has an entry for each condition: the columns of the sheet that may be
     chosen (`schema.LIMITED`; NaN where the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names
     of what differs from the rig so far.
     """
 
-    advice: Remark
+    advice: Annotated[Remark, PlainSerializer(str), Field(alias="text")]
     trials: tuple[Mapping[str, Any], ...] = ()
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
     if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    measurement: Remark = field(default_factory=Remark)
-
-    def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it."""
-        return {
-            "text": str(self.advice),
-            "trials": self.trials,
-            "separation_sigma": self.separation_sigma,
-            "if_true_sigma": self.if_true_sigma,
-            "calibration": str(self.measurement) or None,
-        }
+    measurement: Annotated[Remark, PlainSerializer(lambda told: str(told) or None), Field(alias="calibration")] = field(
+        default_factory=Remark
+    )
 
 
 def _separations(rises: Floats) -> Floats:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincc, ndtri_exp
+from scipy.special import hyperu, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.misfit_tests import CandidateShape, is_plausible
@@ -161,10 +161,9 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
     """
     if degrees_of_freedom < 2 or delta_chi2 <= 0:
         return math.copysign(math.sqrt(abs(delta_chi2)), delta_chi2)
-    # Where the tail probability underflows, the first terms of its asymptotic series: Abramowitz & Stegun 6.5.32.
+    # Also where the tail probability underflows: Γ(a, x) = xᵃ e⁻ˣ U(1, 1 + a, x), https://dlmf.nist.gov/8.5.E3.
     a, x = 0.5 * degrees_of_freedom, 0.5 * delta_chi2
-    p = float(gammaincc(a, x))
-    log_p = math.log(p) if p > 0 else (a - 1) * math.log(x) - x - math.lgamma(a) + math.log1p((a - 1) / x)
+    log_p = a * math.log(x) - x - math.lgamma(a) + math.log(hyperu(1, 1 + a, x))
     return max(float(-ndtri_exp(log_p - math.log(2))), 0.0)
 
 

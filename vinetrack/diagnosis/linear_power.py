@@ -473,7 +473,6 @@ def rates_of(effect: str, outcomes: Sequence[Outcome], value: float, promised: f
         effect=effect,
         value=value,
         promised=promised,
-        alarms=named.total(),
         count=sum(found for _, found in known) if effect else named.total(),
         campaigns=len(known),
         named=tuple(named.most_common()),

@@ -121,7 +121,6 @@ class SimulatedRates:
     value: float
     promised: float
     count: int
-    alarms: int
     campaigns: int
     named: tuple[tuple[str, int], ...]
     failed: int
@@ -249,7 +248,6 @@ class Confounder(JsonRecord):
     symbol: str
     unit: str
     limit: Annotated[OrNaN, Field(alias="limit_95")]
-    value: Annotated[OrNaN, Field(alias="value_at_limit")]
     low_95: OrNaN
     high_95: OrNaN
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 
@@ -57,10 +56,7 @@ from vinetrack.diagnosis.result import (
     Confounder,
 )
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
-from vinetrack.inference.fit import refit
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
@@ -197,8 +193,7 @@ class Search:
 
     def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
         """Keep a set that is fitted from another one, unless no fit succeeds."""
-        with suppress(FitError, SimulationError, np.linalg.LinAlgError):
-            after = refit(fit, reduce(Model.__add__, effects, self.before.model))
+        if after := full_fit(fit, reduce(Model.__add__, effects, self.before.model)):
             self._keep_best(likelihood_ratio(self.before, effects, after))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
@@ -340,9 +335,9 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
             # A shift of less than a standard error of the size is not reported (chosen)
             if abs(shifts[most]) > largest.get(effect.name, (number.sigma, None))[0]:
                 known = (number.key, number.vine, effect.name, shape.size.symbol, shape.size.unit)
-                ends = number.value + shifts[most], number.low + min(*shifts, 0.0), number.high + max(*shifts, 0.0)
-                values = np.clip(ends, number.lower, number.upper).tolist()
-                largest[effect.name] = abs(shifts[most]), Confounder(*known, shape.size.zero + possible[most], *values)
+                ends = number.low + min(*shifts, 0.0), number.high + max(*shifts, 0.0)
+                wider = np.clip(ends, number.lower, number.upper).tolist()
+                largest[effect.name] = abs(shifts[most]), Confounder(*known, shape.size.zero + possible[most], *wider)
         # 3: confounders listed for each size (chosen)
         chosen += [found for _, found in sorted(largest.values(), key=lambda found: -found[0])[:3]]
     return tuple(chosen)
