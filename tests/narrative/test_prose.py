@@ -4,17 +4,14 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from hand_diagnosis import diagnosis
 
 import vinetrack
 from vinetrack.core.problems import remark
 from vinetrack.core.units import display_unit
-from vinetrack.diagnosis.locate import Failure
 from vinetrack.diagnosis.result import (
     PROBABILITIES,
     VERDICTS,
@@ -140,13 +137,6 @@ def test_a_fitted_pressure_and_what_pulls_it_are_told_in_the_unit_of_the_sheet()
     against = row | {"against": "pressure_Pa", "p": 1e-5}
     assert "from 1 psi to 2 psi" in drift_text(against, pressure_unit="psi")
     assert display_unit("1/Pa", "psi") == ("1/psi", pytest.approx(6894.757293))
-
-
-@pytest.mark.parametrize(("z", "count"), [(1.0, 1), (math.nan, 0)])
-def test_nothing_is_said_of_the_scatter_of_replicates_where_there_are_none(z, count):
-    row = {"pressure_Pa": 2e4, "payload_kg": 0.0, "vine": "a", "z": z, "rms_m": 1e-3}
-    failure = Failure("kPa", pd.DataFrame([row]), pd.DataFrame(), SimpleNamespace(remarks=()))
-    assert [one.code for one in failure.remarks()] == ["fails_nowhere"] * count
 
 
 def test_sizes_are_those_fitted_together_with_the_fault_that_remains():

@@ -201,15 +201,12 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         )
         rows.append(row)
     for effect in (effect for name, effect in effects.items() if name not in singles):
-        upper_limits, is_detectable = tests.upper_limits(effect)
         z, is_adequate = tests.best_z(effect.name), step.verdict == ADEQUATE
         # An effect that contains one of the answer set can fit no worse, and need not be fitted.
         reasons = [remark(CONTAINS, name=answer) for answer in effect.replaces if answer in step.answer_names]
         status, delta_chi2, sigma = SCREENED, z**2, z
         if effect.name in tests.products.silent:
             status, delta_chi2, sigma, reasons = NOT_TESTABLE, math.nan, math.nan, [remark("no_response")]
-        elif is_adequate and not is_detectable and z < tests.family[effect.name]:
-            status, reasons = NOT_TESTABLE, [remark("too_weak_here")]
         row = Candidate(
             effect.name,
             effect.kind,
@@ -218,7 +215,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             sigma,
             in_answer_set=effect.name in step.answer_names,
             reason=reasons[0] if reasons else Remark(),
-            largest=upper_limits if is_adequate else {},
+            largest=tests.upper_limits(effect) if is_adequate else {},
         )
         rows.append(row)
     rows += [

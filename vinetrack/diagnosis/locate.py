@@ -21,10 +21,7 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.ladder import (
     AlignedTrials,
     Replicates,
-    ResidualCourse,
-    Scatter,
     align_trials,
-    mean_square,
     orthogonal_part,
     position_errors,
     within_groups,
@@ -47,8 +44,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Failure:
     """Where a model fails; tables in SI, a residual is measurement minus model. `by_condition` has the largest root
-    mean square first, which all pages call the worst condition; `z` is the significance of the mean residual compared
-    with the scatter of replicates.
+    mean square first, which all pages call the worst condition.
     """
 
     pressure_unit: str
@@ -56,30 +52,15 @@ class Failure:
     along_position: pd.DataFrame
     drift: Drift
 
-    @property
-    def fails(self) -> bool:
-        """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
-        from scipy.stats import combine_pvalues, norm
-
-        # 3.0: significance, in standard deviations, from which a model is said to fail
-        level, p = float(norm.sf(3.0)), norm.sf(self.by_condition["z"].to_numpy(float))
-        return bool(p.min() < level / p.size or combine_pvalues(np.maximum(p, 1e-300)).pvalue < level)
-
     def remarks(self) -> Iterator[Remark]:
         """Where the model fails most, by how much, and what drifts."""
         table = self.by_condition
-        known = table[np.isfinite(table["worst_residual_m"])] if self.fails else table.sort_values("z", ascending=False)
-        worst = known.iloc[0]
+        worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
         # What names a condition: its pressure, and payload and vine where they vary
         varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
         condition = {"unit": self.pressure_unit} | {name: worst[name] for name in ("pressure_Pa", *varying)}
-        if self.fails:
-            numbers = {
-                name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")
-            }
-            yield remark("fails_most", condition=condition, **numbers)
-        elif math.isfinite(worst["z"]):  # not where nothing was repeated
-            yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=condition)
+        numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m")}
+        yield remark("fails_most", condition=condition, **numbers)
         yield from self.drift.remarks
 
 
@@ -89,7 +70,7 @@ def locate(fit: Fit) -> Failure:
 
     aligned = align_trials(fit)
     along = _residual_along_growth(aligned)
-    rows = [_condition_row(of, aligned.courses[name], aligned.scatter, along) for name, of in aligned.together.items()]
+    rows = [_condition_row(together, along) for together in aligned.together.values()]
     return Failure(
         pressure_unit=fit.trials[0].trial.pressure_unit,
         by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
@@ -98,20 +79,10 @@ def locate(fit: Fit) -> Failure:
     )
 
 
-def _condition_row(
-    together: Replicates, courses: Sequence[ResidualCourse], scatter: Scatter, along: pd.DataFrame
-) -> Row:
-    """Errors of a condition, and by a normal deviate whether scatter between trials explains means of the replicates
-    as far off: the mean square of the deviates of its stretches, with the degrees of freedom of one trial.
-    """
-    from scipy.stats import f as fisher
-    from scipy.stats import norm
-
+def _condition_row(together: Replicates, along: pd.DataFrame) -> Row:
+    """Errors of a condition, and the mean residual of the stretch where that is largest, with its standard error."""
     errors, trial = position_errors(together), together.trials[0].trial
     stretches = along[along["condition"] == trial.condition]
-    of_trial = mean_square(courses, scatter)[2]
-    square = float(np.mean(stretches["z"] ** 2))
-    p = float(fisher.sf(square, of_trial, scatter.dof * of_trial if scatter.dof else math.inf))
     worst = stretches.iloc[int(stretches["mean_residual_m"].abs().argmax())]
     return {
         "vine": trial.vine,
@@ -120,7 +91,6 @@ def _condition_row(
         "payload_kg": trial.payload_kg,
         "rms_m": errors["rms_position_m"],
         "floor_m": errors["replicate_floor_m"],
-        "z": float(norm.isf(max(p, 1e-300))),
         "worst_residual_m": float(worst["mean_residual_m"]),
         "worst_sigma_m": float(worst["sigma_m"]),
     }

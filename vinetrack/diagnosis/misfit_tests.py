@@ -590,9 +590,6 @@ MISSED_FRACTION = 6e-4
 # this many standard deviations (chosen)
 SEARCH_CHI2_PER_DOF, SEARCH_SIGMAS = 1.5, 6.0
 
-# Significance that the largest plausible size of an effect must reach for the effect to be testable (chosen)
-TESTABLE_SIGMAS = 3.0
-
 
 LARGEST_MISSED = 0.1  # Misfit of a trial, as a part of its growth, that no error of a track explains (chosen)
 
@@ -689,27 +686,23 @@ class MisfitTests:
         """Largest z of an effect; 0 where no trial responds to it."""
         return float(np.max(self.one_sided_z[self.ranked_shapes(name)], initial=0.0))
 
-    def upper_limits(self, effect: Effect) -> tuple[dict[str, float], bool]:
-        """Upper limit (one-sided 95 %) of an undetected size, and whether a plausible size would be detected at all.
-        Returns limits (by `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable),
-        testable. Student's t counts where errors are those of the scatter of trials.
+    def upper_limits(self, effect: Effect) -> dict[str, float]:
+        """Upper limit (one-sided 95 %) of an undetected size by `effect.parameter`, SI; empty where the trials have no
+        information about it. Student's t counts where errors are those of the scatter of trials.
         """
         from scipy.stats import norm, t
 
         indices = self.ranked_shapes(effect.name)
-        if not indices or not effect.parameters:
-            return {}, bool(indices)
         size, sigma = self.scores.size[indices], self.scores.sigma[indices]
+        if not indices or not effect.parameters or not np.isfinite(sigma).all():
+            return {}
         parameter = self.products.shapes[indices[0]].size
-        largest_plausible = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
-        if not np.isfinite(sigma).all() or largest_plausible < TESTABLE_SIGMAS * sigma.min():
-            return {}, False
         # The limit of the shape with the largest one holds whatever form the effect has.
         beyond = np.maximum(parameter.sign * size, 0.0) if parameter.sign else np.abs(size)
         by_scatter = (self.scores.robust_sigma > self.scores.plain_sigma)[indices]
         limits = beyond + np.where(by_scatter, t.ppf(0.95, max(self.scores.degrees, 3.0)), norm.ppf(0.95)) * sigma
         sign = parameter.sign or math.copysign(1.0, size[np.argmax(limits)])
-        return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}, True
+        return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}
 
 
 def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
