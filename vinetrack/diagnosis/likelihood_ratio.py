@@ -111,7 +111,11 @@ def likelihood_ratio(
     """Compare a refit with the fit without the effects."""
     delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
-    none, reason = _compatible_with_none(effects, after), implausible(effects, after)
+    # A fit whose size is smaller than its error is better because of the parameters that shape the effect. Differences
+    # between groups are contrasts: each group's value may be uncertain where their difference is not.
+    in_errors = [size_in_errors(effect, after) for effect in effects if effect.kind != BETWEEN_TRIALS]
+    none = remark("size_may_be_zero") if min(in_errors, default=math.inf) < MIN_SIZE_SIGMAS else Remark()
+    reason = implausible(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
         fit=after,
@@ -133,15 +137,6 @@ def size_in_errors(effect: Effect, after: Fit) -> float:
         if number.key == f"{effect.name}.{parameter.name}" and 0 < number.sigma < math.inf
     ]
     return max(sizes, default=math.inf)
-
-
-def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> Remark:
-    """Say that a fitted size is smaller than its standard error; blank where none is. Such a fit is better because of
-    the parameters that shape the effect, and its size is not determined.
-    """
-    # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
-    sizes = [size_in_errors(effect, after) for effect in effects if effect.kind != BETWEEN_TRIALS]
-    return remark("size_may_be_zero") if min(sizes, default=math.inf) < MIN_SIZE_SIGMAS else Remark()
 
 
 def sizes_of(effects: Sequence[Effect], after: Fit) -> int:

@@ -33,7 +33,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import (
-    LEAST_CHI2_PER_POINT,
     LEAST_MISFIT_REDUCTION,
     QUANTITIES,
     VARIABLES,
@@ -256,10 +255,9 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
         reason = Remark() if tied else remark("no_law_predicts_better" if best else "no_law_detected")
         # The learned force as a table, where it explains what no law does
-        misfit = before.chi2_per_dof - 1
         remaining = min((law.ratio.fit.chi2_per_dof for law in tied), default=before.chi2_per_dof) - 1
         # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
-        is_open = misfit >= LEAST_CHI2_PER_POINT - 1 and remaining >= (1 - 0.9) * misfit
+        is_open = remaining >= (1 - 0.9) * (before.chi2_per_dof - 1)
         tried = [force.learned] if force.learned is not None and is_open else []
         start, tables = _fitted(before, tried, Path(folder), report)
         tables = [

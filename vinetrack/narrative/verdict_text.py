@@ -440,9 +440,6 @@ def explain(step: SelectionStep) -> str:
     if step.note:
         note = str(step.note)
         text += f" {note[0].upper()}{note[1:]} ({' and '.join(best.names)} together do)."
-    text += "".join(
-        f" {name} has the size that results if {slip}: check that first." for slip, name in step.slips.items()
-    )
     text += remedies_in_words(step)
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
