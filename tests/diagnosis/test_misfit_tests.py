@@ -12,7 +12,7 @@ from hidden_truth import grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
-from vinetrack.diagnosis import ladder, likelihood_ratio, selection
+from vinetrack.diagnosis import ladder, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis.selection import slack_fit
 from vinetrack.effects import Parameter
@@ -235,12 +235,12 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again():
     """Of trials whose tail rubs. Of many trials a search lets go of curves."""
     model, pairs = vt.base_model(), grown({"tail_friction.mu_w": 1.0}, seed=7270)
     fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]))
-    light = likelihood_ratio.without_curves(fit)
+    light = selection.without_curves(fit)
     assert not light.trials
     of_light, of_fit = (relative_residuals(one.predictor, one.solution) for one in (light, fit))
     assert of_light.tolist() == of_fit.tolist()
     steps = fit.predictor.steps.copy()
-    again = likelihood_ratio.with_curves(light)
+    again = selection.with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)
     assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
     for trial, before_trial in zip(again.trials, fit.trials, strict=True):

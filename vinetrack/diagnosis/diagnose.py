@@ -165,11 +165,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
         slips=step.slips,
         cosines=Cosines(names, cosines.tolist()),
         fit=tests.fit,
-        fits={
-            hypothesis.names[-1]: hypothesis.fit
-            for hypothesis in step.answer_set
-            if hypothesis.effects[-1].kind != BETWEEN_TRIALS
-        },
+        fits=tuple(one.fit for one in step.answer_set if one.effects[-1].kind != BETWEEN_TRIALS),
         sets=sets if any(len(effects) > 1 for effects in sets) else (),
         partial=tuple(_refitted(likelihood_ratio(before, one.effects[-1:], one.fit)) for before, one in partial),
         partial_fits=partial_fits,
@@ -250,7 +246,7 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report, ladde
     experiment, which would discriminate between the hypotheses that remain. A note says why one cannot be computed.
     """
     last, is_unexplained = result.rounds[-1], UNEXPLAINED in (result.verdict, result.final_verdict)
-    tied = list(last.fits.values())
+    tied = list(last.fits)
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:
         tied.insert(0, last.fit)
     are_tied = last.verdict in (AMBIGUOUS, ARTEFACT) and len(tied) > 1
@@ -390,7 +386,7 @@ def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
         return replace(result, notes=(*result.notes, remark("frames_perhaps_missing", trials=tuple(lost))))
     note = remark("with_corrected_times", verdict=result.verdict, explanation=result.explanation)
     words = str(remark("frames_missing", trials=tuple(lost)))
-    nothing: dict[str, Any] = {"fits": {}, "sets": (), "partial": (), "partial_fits": ()}
+    nothing: dict[str, Any] = {"fits": (), "sets": (), "partial": (), "partial_fits": ()}
     only = replace(result.rounds[0], explanation=words, verdict=ARTEFACT, answer_set=(DROPPED_FRAMES,), **nothing)
     alone = replace(result, rounds=(only,), effects=(), explanation=words, fits=result.fits[:1])
     return replace(alone, notes=(note,), odd_trials=())

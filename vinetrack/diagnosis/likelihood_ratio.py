@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ import numpy as np
 from scipy.special import hyperu, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.diagnosis.misfit_tests import CandidateShape, is_plausible
+from vinetrack.diagnosis.misfit_tests import is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
-from vinetrack.dynamics.model import Model, Value
+from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
@@ -25,8 +25,6 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit
-from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import assemble
 
 # ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
@@ -231,29 +229,6 @@ def stand_in(name: str, kind: str = "physical", parameters: tuple[Parameter, ...
     return Effect(name=name, kind=kind, summary=name, text=name, parameters=parameters, functions={}, path=Path(name))
 
 
-def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
-    """Values of an effect's parameters to start from: the predicted size, limited to what is possible. Returns by
-    `effect.parameter`, SI.
-    """
-    effect = shape.effect
-    if not effect.parameters:
-        return {}
-    parameter = shape.size
-    low, high = parameter.bounds
-    if shape.whole:
-        size = shape.step
-    elif parameter.plausible is not None:
-        # A prediction far beyond the plausible range is an extrapolation of the linear model.
-        reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
-        size = float(np.clip(size, -reach, reach))
-    if parameter.sign * size < 0 or size == 0:
-        size = parameter.sign * abs(shape.step) or shape.step
-    start = float(np.clip(parameter.zero + size, low, high))
-    by_group = dict.fromkeys(shape.other_groups, parameter.zero) | {shape.group: start}
-    values: tuple[Value, ...] = (by_group if shape.group else start, *shape.other_values)
-    return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
-
-
 def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf, **how: Any) -> Fit | None:
     """Refit with another model, or other options of `refit`; None where the fit fails. `best` is the largest ln L of
     other hypotheses: a fit that stays far behind it, or far off the tracks, is given up.
@@ -266,33 +241,3 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
         return refit(fit, most_iterations=40)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-
-
-# ------------------------------------------------------------------------------
-# Memory of a search about many trials. The curves of a fit to a thousand trials take some sixty megabytes, its misfit
-# tests 700, and a search makes dozens of fits: they are kept without curves, which are computed again where needed.
-
-
-def is_large(fit: Fit) -> bool:
-    """Whether a fit has so many points that the fits of a search cannot be kept whole."""
-    # 150_000: points of all trials from which curves are let go (chosen)
-    return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > 150_000
-
-
-def without_curves(fit: Fit) -> Fit:
-    """Return a fit without its curves: its numbers, its state and the residuals of each trial."""
-    residuals = tuple(columns[:, -1:].copy() for columns in fit.solution.columns)
-    return replace(fit, trials=(), solution=replace(fit.solution, columns=residuals))
-
-
-def with_curves(fit: Fit) -> Fit:
-    """Return a fit with its curves, computed again where they were dropped."""
-    if fit.trials:
-        return fit
-    former, state = fit.predictor, fit.solution.state
-    predictor = Predictor(former.layout, former.data, former.host).with_steps_of(former)
-    columns = predictor.linearise(state.theta, state.trial_effects)
-    # Cross products stay those of the fit, whose columns were computed with other steps.
-    solution = replace(fit.solution, columns=tuple(columns))
-    trials = assemble(former, solution, fit.left_out, fit.options).trials
-    return replace(fit, trials=trials, solution=solution)

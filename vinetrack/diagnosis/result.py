@@ -321,7 +321,7 @@ class Round(JsonRecord):
     ranking: tuple[StoredCandidate, ...] = ()
     cosines: Cosines = Cosines()
     fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None
-    fits: Annotated[Mapping[str, InstanceOf[Fit]], Field(exclude=True)] = field(default_factory=dict)
+    fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
     partial_fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
 
 

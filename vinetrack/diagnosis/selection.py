@@ -24,20 +24,17 @@ from vinetrack.diagnosis.likelihood_ratio import (
     best_of,
     full_fit,
     in_sigmas,
-    is_large,
     likelihood_ratio,
     robust_ratio,
     size_in_errors,
     sizes_of,
     stand_in,
-    start_values,
-    with_curves,
-    without_curves,
 )
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
+    CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     has_excess_scatter,
@@ -55,11 +52,12 @@ from vinetrack.diagnosis.result import (
     UNEXPLAINED,
     Confounder,
 )
-from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.solving import assemble
 
 # ------------------------------------------------------------------------------
 # Fits of effects, and of sets of them by forward steps: from the best sets of k effects, those are added that the score
@@ -256,6 +254,59 @@ def _worth(larger: LikelihoodRatio, smaller: LikelihoodRatio, added: Sequence[Ef
     delta_chi2 = 2 * (larger.fit.log_likelihood - smaller.fit.log_likelihood)
     inflation = robust_ratio(larger.fit, [effect.name for effect in added]) ** 2
     return in_sigmas(delta_chi2 / inflation, sizes_of(added, larger.fit))
+
+
+def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
+    """Values of an effect's parameters to start from: the predicted size, limited to what is possible. Returns by
+    `effect.parameter`, SI.
+    """
+    effect = shape.effect
+    if not effect.parameters:
+        return {}
+    parameter = shape.size
+    low, high = parameter.bounds
+    if shape.whole:
+        size = shape.step
+    elif parameter.plausible is not None:
+        # A prediction far beyond the plausible range is an extrapolation of the linear model.
+        reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
+        size = float(np.clip(size, -reach, reach))
+    if parameter.sign * size < 0 or size == 0:
+        size = parameter.sign * abs(shape.step) or shape.step
+    start = float(np.clip(parameter.zero + size, low, high))
+    by_group = dict.fromkeys(shape.other_groups, parameter.zero) | {shape.group: start}
+    values: tuple[Value, ...] = (by_group if shape.group else start, *shape.other_values)
+    return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
+
+
+# ------------------------------------------------------------------------------
+# Memory of a search about many trials. The curves of a fit to a thousand trials take some sixty megabytes, its misfit
+# tests 700, and a search makes dozens of fits: they are kept without curves, which are computed again where needed.
+
+
+def is_large(fit: Fit) -> bool:
+    """Whether a fit has so many points that the fits of a search cannot be kept whole."""
+    # 150_000: points of all trials from which curves are let go (chosen)
+    return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > 150_000
+
+
+def without_curves(fit: Fit) -> Fit:
+    """Return a fit without its curves: its numbers, its state and the residuals of each trial."""
+    residuals = tuple(columns[:, -1:].copy() for columns in fit.solution.columns)
+    return replace(fit, trials=(), solution=replace(fit.solution, columns=residuals))
+
+
+def with_curves(fit: Fit) -> Fit:
+    """Return a fit with its curves, computed again where they were dropped."""
+    if fit.trials:
+        return fit
+    former, state = fit.predictor, fit.solution.state
+    predictor = Predictor(former.layout, former.data, former.host).with_steps_of(former)
+    columns = predictor.linearise(state.theta, state.trial_effects)
+    # Cross products stay those of the fit, whose columns were computed with other steps.
+    solution = replace(fit.solution, columns=tuple(columns))
+    trials = assemble(former, solution, fit.left_out, fit.options).trials
+    return replace(fit, trials=trials, solution=solution)
 
 
 # ------------------------------------------------------------------------------
