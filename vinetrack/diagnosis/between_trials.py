@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from scipy.special import fdtrc
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import within_groups
@@ -237,15 +238,13 @@ def _p_value(fit: Fit, difference: Difference, gain: float, extra: int) -> float
     parameters and scatter, which both hypotheses fit: in simulations of 8 to 24 trials in 2 to 6 groups, α was exceeded
     by no more than 0.07 α.
     """
-    from scipy.stats import f as fisher
-
     if gain <= 0:
         return 1.0
     if any(math.isfinite(term.prior_sd) for term in difference.terms):
         return min(1.0, math.exp(-0.5 * gain))
     trials = len(fit.trials)
     spare = max(trials - int(np.count_nonzero(fit.predictor.layout.prior_precision == 0)) - extra, 1)
-    return float(fisher.sf(math.expm1(min(gain / trials, 500.0)) * spare / extra, extra, spare))
+    return float(fdtrc(extra, spare, math.expm1(min(gain / trials, 500.0)) * spare / extra))
 
 
 def _likeliest(fit: Fit, base: Solution, forms: Iterable[Difference]) -> Difference:

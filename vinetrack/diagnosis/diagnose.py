@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Track, Trial, with_flag
@@ -45,16 +47,14 @@ from vinetrack.diagnosis.selection import Report, SelectionStep, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
+from vinetrack.experiment.folder import Experiment
+from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.inference.sensitivity import middle_speed
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing, longer_than_stated
 from vinetrack.tracks.position_noise import rejected_points_note
-
-if TYPE_CHECKING:
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import Limits
 
 
 @in_one_blas_thread
@@ -72,8 +72,6 @@ def diagnose(
     fitted: Fit | None = None,
 ) -> Diagnosis:
     """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
-    from vinetrack.experiment.folder import Experiment
-
     if isinstance(source, Fit):
         fitted, model, source = source, source.model, source.pairs
     if isinstance(source, Experiment):
@@ -312,9 +310,6 @@ class OddTrial:
 
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     """Find trials whose speed contradicts the sheet although the other trials agree with it."""
-    from scipy.optimize import least_squares
-    from scipy.stats import t as student
-
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
         return []
@@ -345,7 +340,7 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     scatter = max(median_deviation * math.sqrt(len(data) / remaining), 0.02)
     # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
     # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
-    allowed = scatter * float(student.isf(CHANCE / (2 * len(data)), max(0.37 * remaining + 1.0, 3.0)))
+    allowed = scatter * -float(stdtrit(max(0.37 * remaining + 1.0, 3.0), CHANCE / (2 * len(data))))
     replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip
     # Where a replicate deviates as much, the cause is physics of the condition.

@@ -21,6 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import LEAST_SCATTER, align_trials
@@ -190,8 +192,6 @@ def acceleration_sensitivities(
 
 def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Floats:
     """Values at the steps of a motion interpolated linearly. Shapes: since_s (n,); values (N_STEPS + 1, k) → (n, k)."""
-    from scipy.interpolate import make_interp_spline
-
     return np.asarray(make_interp_spline(motion.time_s, values, k=1)(np.clip(since_s, 0.0, motion.time_s[-1])))
 
 
@@ -252,8 +252,6 @@ def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> Fitted
 
 
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
-    from scipy.integrate import cumulative_trapezoid
-
     since_s = data.time_s - trial_effects[RELEASE]
     position_m = data.lead_position_m - trial_effects[ORIGIN]
     position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
@@ -461,8 +459,6 @@ class ForceEquations:
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
     """Observed position and velocity of the leading edge, by cubic interpolation between the points of the grid."""
-    from scipy.interpolate import CubicHermiteSpline
-
     curve = CubicHermiteSpline(motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s)
     at = np.clip(since_s, 0.0, motion.time_s[-1])
     moving = (since_s > 0) & (since_s < motion.time_s[-1])

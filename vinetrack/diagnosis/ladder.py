@@ -16,10 +16,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
@@ -38,10 +40,6 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE,
 from vinetrack.kinematics.summary import lead_velocity_at
 from vinetrack.kinematics.velocity import estimate_kinematics
 from vinetrack.tracks.position_noise import rest_points
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 # ------------------------------------------------------------------------------
 # The fit of the initial model, for `fit.json` and for the diagnosis. A model that is far off has several minima close
@@ -108,8 +106,6 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     it: interpolation would average the noise of positions away, and positions, other than residuals, change by much
     more than their noise within half a frame.
     """
-    import pandas as pd
-
     step_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
     parts = [
         pd.DataFrame(
@@ -306,12 +302,10 @@ def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter, further_
     many degrees of freedom as a trial has, so many has every replicate: the range is of F. `further_m2` is a mean
     square that adds to that of the trials' scatter.
     """
-    from scipy.stats import f as fisher
-
     if not scatter.dof:
         return dict.fromkeys(EXPECTED, math.nan)
     mean_m2, degrees, of_trial = mean_square(courses, scatter)
-    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trial)
+    ends = fdtri(degrees, scatter.dof * of_trial, (0.025, 0.975))
     return dict(zip(EXPECTED, (math.sqrt((mean_m2 + further_m2) * part) for part in (1.0, *ends)), strict=True))
 
 
@@ -367,8 +361,6 @@ def compare(
     final_at_fraction: float = FINAL_AT_FRACTION,
 ) -> Comparison:
     """Compare a fitted model with trials."""
-    import pandas as pd
-
     aligned = align_trials(fit)
     measured = {trial.name: track for trial, track in pairs}
     final = _final_speed_errors(aligned, measured, kinematics or {}, final_at_fraction)
@@ -476,8 +468,6 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     The floor, and the error expected of an adequate model, are those of replicates laid on the last model that claims
     to be one. `attrs["notes"]` are remarks about trials that could not be predicted.
     """
-    import pandas as pd
-
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
     settled = len(fits) - partial - 1

@@ -21,7 +21,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, stdtrit
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
@@ -289,7 +289,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     residual = np.sqrt(share) * noise - share * score[:, None]
     residual = residual - residual.mean(axis=1, keepdims=True)
     ratio = np.sqrt(np.sum(residual**2, axis=1) * trials / scores.degrees)
-    t_threshold = float(t.isf(norm.sf(limit), max(scores.degrees, 3.0)))
+    t_threshold = -float(stdtrit(max(scores.degrees, 3.0), ndtr(-limit)))
     return np.asarray(np.maximum(threshold, t_threshold * ratio) - score)
 
 

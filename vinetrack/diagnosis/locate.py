@@ -13,9 +13,11 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from scipy.special import ndtri, stdtr
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.ladder import (
@@ -34,9 +36,6 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +65,6 @@ class Failure:
 
 def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails."""
-    import pandas as pd
-
     aligned = align_trials(fit)
     along = _residual_along_growth(aligned)
     rows = [_condition_row(together, along) for together in aligned.together.values()]
@@ -100,8 +97,6 @@ def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
     """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
     its standard error.
     """
-    import pandas as pd
-
     multiple, rows = aligned.scatter.multiple, list[tuple[object, ...]]()
     every = list(itertools.chain(*aligned.courses.values()))
     for condition, members in aligned.courses.items():
@@ -162,8 +157,6 @@ class Drift:
 
 def drift(fit: Fit, aligned: AlignedTrials | None = None) -> Drift:
     """Test B for drift with pressure, payload, angle, chamber or inlet, and P_y against the sheet."""
-    import pandas as pd
-
     tests = list(against_the_sheet(fit))
     if DAMPING in fit.predictor.layout.keys:
         of_trials = per_trial_estimates(fit, aligned or align_trials(fit))
@@ -180,8 +173,6 @@ def drift(fit: Fit, aligned: AlignedTrials | None = None) -> Drift:
 
 def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     """Return the best values of each group of trials under the first model and, where something was added, the last."""
-    import pandas as pd
-
     parts = [before.groups.assign(model="before")]
     if after is not None:
         try:
@@ -207,10 +198,8 @@ def _tested(
     """A test as a row of the table, with its p-value and its `groups`: levels from and to, the change between them and
     its standard error. `told` is what the sentence about it needs besides.
     """
-    from scipy.stats import norm
-
     subject: Row = {"parameter": number.key, "vine": vine, "symbol": number.symbol, "against": against}
-    row = subject | dict(zip(DRIFT_COLUMNS[4:], (*levels, *change, float(norm.isf(max(p, 1e-300) / 2))), strict=False))
+    row = subject | dict(zip(DRIFT_COLUMNS[4:], (*levels, *change, -float(ndtri(max(p, 1e-300) / 2))), strict=False))
     sentence = remark("drifts", row=row, pressure_unit=number.pressure_unit, **told)
     return row | {"sentence": sentence, "p": p, "groups": [subject | group for group in groups]}
 
@@ -225,8 +214,6 @@ def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> pd.DataFrame:
     (blank where all have one B), the `deviation` of the best ln B from the common value, and its `weight`, the inverse
     of its variance by a typical scatter of pressure and B, up to a factor.
     """
-    import pandas as pd
-
     has_own = any(number.vine for number in fit.numbers if number.key == DAMPING)
     rows = list[tuple[object, ...]]()
     for i, (trial_data, columns) in enumerate(zip(aligned.predictor.data, aligned.columns, strict=True)):
@@ -246,9 +233,6 @@ def _against(of_trials: pd.DataFrame, number: Number, against: str) -> Iterator[
     """Tests of a linear trend against one condition, of each vine alone and of all, about the mean of each vine
     (Student's t). The variance is that of replicates, or about the slope where there are too few.
     """
-    import pandas as pd
-    from scipy.stats import t as student
-
     levels = np.array([float(getattr(trial, against)) for trial in of_trials["trial"]])
     linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
     known = of_trials.assign(level=levels, x=levels if linear else np.log(levels))[np.isfinite(levels)]
@@ -273,7 +257,7 @@ def _against(of_trials: pd.DataFrame, number: Number, against: str) -> Iterator[
             groups.append({"level": level, "ratio": ratio, "ratio_sigma": error, "n_trials": len(alike)})
         reach, ends = float(np.ptp(tested["x"])), (float(tested["level"].min()), float(tested["level"].max()))
         # Relative change from the smaller value, with its standard error
-        larger, p = math.exp(abs(slope) * reach), float(2 * student.sf(abs(slope) / sigma, dof))
+        larger, p = math.exp(abs(slope) * reach), float(2 * stdtr(dof, -abs(slope) / sigma))
         of_test = (ends if slope >= 0 else ends[::-1], (larger - 1, larger * sigma * reach), p, groups)
         yield _tested(number, vines[0] if n_vines == 1 else "", against, *of_test)
 

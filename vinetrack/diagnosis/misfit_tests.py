@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import fdtrc, ndtri, ndtri_exp, stdtr, stdtrit
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
@@ -392,15 +392,13 @@ class Scores:
         smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to the
         normal quantile of the same tail probability.
         """
-        from scipy.stats import norm, t
-
         size, sign = self.size, np.array(signs)
         allowed_size = np.where(sign == 0, np.abs(size), np.maximum(size * sign, 0.0))
         z = allowed_size / self.plain_sigma
         with np.errstate(divide="ignore", invalid="ignore"):
             robust_t = np.where(self.robust_sigma > 0, allowed_size / self.robust_sigma, np.inf)
-        log_tail = t.logsf(np.minimum(robust_t, 1e6), max(self.degrees, 3.0))
-        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(log_tail, -700.0)))))
+            log_tail = np.log(stdtr(max(self.degrees, 3.0), -robust_t))
+        return np.asarray(np.minimum(z, -ndtri_exp(log_tail)))
 
     @property
     def cosines(self) -> Floats:
@@ -561,8 +559,6 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     """p-value of a one-way analysis of variance; 1 where the group means differ by less than `allowed`, rms. NaN where
     too few members tell; with no more groups than parameters fitted to them, no difference between groups can show.
     """
-    from scipy.stats import f
-
     apart, inner = within_groups(values, groups)
     outer = values.size - inner - fitted
     if inner < MIN_REPLICATE_DEGREES or outer < 1:
@@ -572,7 +568,7 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
         return 1.0
     # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
     within_variance = max(within / inner, allowed**2 / 9)
-    return float(f.sf(between / outer / within_variance, outer, inner))
+    return float(fdtrc(outer, inner, between / outer / within_variance))
 
 
 # Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
@@ -690,8 +686,6 @@ class MisfitTests:
         """Upper limit (one-sided 95 %) of an undetected size by `effect.parameter`, SI; empty where the trials have no
         information about it. Student's t counts where errors are those of the scatter of trials.
         """
-        from scipy.stats import norm, t
-
         indices = self.ranked_shapes(effect.name)
         size, sigma = self.scores.size[indices], self.scores.sigma[indices]
         if not indices or not effect.parameters or not np.isfinite(sigma).all():
@@ -700,7 +694,7 @@ class MisfitTests:
         # The limit of the shape with the largest one holds whatever form the effect has.
         beyond = np.maximum(parameter.sign * size, 0.0) if parameter.sign else np.abs(size)
         by_scatter = (self.scores.robust_sigma > self.scores.plain_sigma)[indices]
-        limits = beyond + np.where(by_scatter, t.ppf(0.95, max(self.scores.degrees, 3.0)), norm.ppf(0.95)) * sigma
+        limits = beyond + np.where(by_scatter, stdtrit(max(self.scores.degrees, 3.0), 0.95), ndtri(0.95)) * sigma
         sign = parameter.sign or math.copysign(1.0, size[np.argmax(limits)])
         return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}
 

@@ -18,9 +18,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
@@ -44,9 +45,6 @@ from vinetrack.inference.gaussian_processes import (
     splines,
     standard_error,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # What a force may depend on, and the attribute of a motion that holds it
 VARIABLES = {
@@ -265,8 +263,6 @@ class LearnedForce:
         """The force on a grid of its variables (condition blank), with the number of trials that visited each point,
         and along the first trial of each condition. Columns `VARIABLES`, force_N, sigma_N, trials, condition.
         """
-        import pandas as pd
-
         plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
         axes, names = self.domain.axes, [VARIABLES[name] for name in self.domain.variables]
         ends = [np.linspace(axis.low, axis.high, plot_points[len(axes) - 1]) for axis in axes]

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Track
@@ -44,15 +44,10 @@ from vinetrack.diagnosis.missing_force import (
 from vinetrack.diagnosis.selection import Search
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, own_effects, remember
+from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from vinetrack.experiment.folder import Experiment
-
 
 # ------------------------------------------------------------------------------
 # One effect added to the model by hand: both models are fitted, and compared on conditions that were left out.
