@@ -43,7 +43,7 @@ def loaded(small_run):
 
 
 def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded):
-    assert {"trials", "conditions", "steady", "ladder", "comparison", "diagnosis/moved"} <= set(loaded.tables)
+    assert {"trials", "conditions", "steady", "ladder", "comparison", "diagnosis/steps"} <= set(loaded.tables)
     assert loaded.tables["ladder"].equals(loaded.ladder)
     assert [name for name in loaded.ladder.columns if "rms" in name and not name.endswith("_m")] == []
     # Models carry fitted values and what was added.
@@ -135,24 +135,12 @@ def report(small_run):
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", re.sub("</?code>", "", page))).split())
 
 
-def test_numbers_of_the_initial_model_are_those_that_the_diagnosis_began_with(loaded):
-    moved = loaded.tables["diagnosis/moved"]
-    first = moved[moved["added"] == ""].set_index(["parameter", "vine"])
-    for entry in loaded.fit.numbers:
-        row = first.loc[(entry.key, entry.vine)]
-        assert row["value"] == pytest.approx(entry.value, rel=1e-9)
-        assert row["sigma"] == pytest.approx(entry.sigma, rel=1e-9)
-
-
 def test_errors_of_the_ladder_are_those_of_the_comparison_and_its_floor_is_one(loaded):
     compared = loaded.tables["comparison"]
     rms_m = math.sqrt(float(np.mean(compared["rms_position_m"] ** 2)))  # as many replicates in every condition
     assert loaded.ladder["rms_in_sample_m"].iloc[0] == pytest.approx(rms_m, rel=1e-9)
     assert np.isfinite(loaded.ladder["floor_m"]).all()
     assert len(set(loaded.ladder["floor_m"])) == 1
-    located = loaded.tables["diagnosis/conditions"].set_index("condition")
-    for row in compared.itertuples():
-        assert located.loc[str(row.condition), "rms_m"] == pytest.approx(row.rms_position_m, rel=1e-9)
 
 
 def test_the_report_quotes_the_final_model_first(report, loaded):
@@ -184,11 +172,8 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
 def test_the_worst_condition_is_one(loaded, report, small_run):
     compared = loaded.tables["comparison"]
     worst = str(compared.loc[compared["rms_position_m"].idxmax(), "condition"])
-    assert loaded.tables["diagnosis/conditions"]["condition"].iloc[0] == worst
     pressure = f"{float(worst.partition('kPa')[0].rpartition('_')[2]):g} kPa"
     assert f"Worst is {worst}" in report
     assert loaded.diagnosis is not None
-    assert loaded.diagnosis.where[0].startswith(
-        (f"The model fails most at {pressure}", "In no condition does the mean")
-    )
+    assert loaded.diagnosis.where[0].startswith(f"The model fails most at {pressure}")
     assert pressure in (small_run / "figures" / "before_after.svg").read_text("utf-8")

@@ -54,11 +54,6 @@ class Difference:
     gain: float = 0.0
     p: float = 1.0
 
-    @property
-    def penalised_gain(self) -> float:
-        """Fall of −2 ln L less the penalty 2 ln(`n_forms`) for the choice among forms."""
-        return self.gain - 2 * math.log(self.n_forms)
-
 
 # ------------------------------------------------------------------------------
 # Forms of the hypotheses: which parameter differs between which trials, and whether that follows the conditions.
@@ -227,7 +222,8 @@ def differences(fit: Fit) -> list[Difference]:
                 p = _p_value(fit, form, gain, widened.problem.prior_mean.size - base.problem.prior_mean.size)
                 n_forms = form.n_forms * len(forms)
                 estimated.append(replace(form, gain=gain, n_forms=n_forms, p=min(p * n_forms, 1.0)))
-        best += sorted(estimated, key=lambda form: -form.penalised_gain)[:1]
+        # By the fall of −2 ln L, less the penalty 2 ln N for the choice among N forms
+        best += sorted(estimated, key=lambda form: 2 * math.log(form.n_forms) - form.gain)[:1]
     return best
 
 
