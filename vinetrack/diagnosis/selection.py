@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
@@ -439,7 +439,6 @@ class SelectionStep:
     fitted: tuple[LikelihoodRatio, ...] = ()
     rejected: tuple[tuple[str, Remark], ...] = ()
     answer_names: tuple[str, ...] = ()
-    note: Remark = field(default_factory=Remark)
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
@@ -574,12 +573,11 @@ def _rounds(
         verdict = ARTEFACT if kinds[name] == "measurement" else MISSING
         remaining = sorted((one for one in best.effects if one not in added), key=lambda one: one.name != name)
         together = likelihood_ratio(round_tests.fit, remaining, best.fit)
-        note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
         subset = search.subset(best, (*added, remaining[0])) if added or verdict == MISSING else None
         if added:
             alone = [] if subset is None else [likelihood_ratio(round_tests.fit, remaining[:1], subset.fit)]
             fitted, reasons = (*alone, together), ()
-        steps.append(SelectionStep(verdict, round_tests, (together,), fitted, reasons, (name,), note))
+        steps.append(SelectionStep(verdict, round_tests, (together,), fitted, reasons, (name,)))
         if verdict == ARTEFACT:
             return steps
         added = (*added, remaining[0])

@@ -432,14 +432,14 @@ def explain(step: SelectionStep) -> str:
     if verdict == ARTEFACT and trials_differ(step.answer_names):
         verdict = BETWEEN_TRIALS
     best = answers[0]
-    facts: dict[str, Any] = {"name": best.names[0] if step.note else best.names[-1], "model": model, "trials": trials}
+    several = len(step.answer_names) == 1 < len(best.names)  # of which this round adds the first
+    facts: dict[str, Any] = {"name": best.names[0 if several else -1], "model": model, "trials": trials}
     facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
     reach = ANSWER_SET_DELTA_CHI2 * best.inflation
     facts |= {"hypotheses": "; ".join(map(hypothesis_in_words, answers)), "reach": reach}
     text = sentence(_EXPLAINED[verdict], facts)
-    if step.note:
-        note = str(step.note)
-        text += f" {note[0].upper()}{note[1:]} ({' and '.join(best.names)} together do)."
+    if several:
+        text += f" {sentence('several_missing', {'count': len(best.names), 'names': best.names})}"
     text += remedies_in_words(step)
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
