@@ -241,8 +241,8 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
         bump = 8e-3 * np.exp(-0.5 * ((y - 0.14) / 0.03) ** 2) * (trial.condition == chosen)
         bent.append((trial, replace(track, lead_position_m=track.lead_position_m + bump)))
     found = locate(fitted(bent))
-    worst = found.by_condition.iloc[0]
-    assert worst["condition"] == chosen
+    worst = found.worst.facts
+    assert worst["condition"] == {"unit": "kPa", "pressure_Pa": pairs[4][0].pressure_Pa}
     assert worst["worst_residual_m"] == pytest.approx(7e-3, abs=3e-3)
     there = found.along_position[found.along_position["condition"] == chosen]
     best = there.loc[there["mean_residual_m"].idxmax()]
@@ -251,7 +251,7 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
 
 def test_single_trials_are_judged_by_the_scatter_of_the_fit():
     found = locate(fitted(pairs_of(grown(sheet(replicates=1), 78))))
-    assert found.by_condition["floor_m"].isna().all()
+    assert math.isnan(found.worst.facts["floor_m"])
     assert found.along_position["z"].abs().max() < 4
 
 

@@ -271,7 +271,7 @@ def _located(result: Diagnosis) -> Diagnosis:
     """Add where the first model fails, and which of its parameters drift."""
     failure = locate(result.fits[0])
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
-    return replace(result, failure=failure, where=tuple(failure.remarks()), drift=drift)
+    return replace(result, failure=failure, where=failure.remarks, drift=drift)
 
 
 def _with_missing_force(result: Diagnosis) -> Diagnosis:

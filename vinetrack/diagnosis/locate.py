@@ -22,10 +22,9 @@ from scipy.special import ndtri, stdtr
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.ladder import (
     AlignedTrials,
-    Replicates,
     align_trials,
     orthogonal_part,
-    position_errors,
+    rms_of,
     within_groups,
 )
 from vinetrack.diagnosis.result import MAX_STRETCHES
@@ -42,55 +41,45 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Failure:
-    """Where a model fails; tables in SI, a residual is measurement minus model. `by_condition` has the largest root
-    mean square first, which all pages call the worst condition.
+    """Where a model fails: what is said of the worst condition, the mean residuals (measurement minus model) along the
+    growth, SI, and what drifts.
     """
 
-    pressure_unit: str
-    by_condition: pd.DataFrame
+    worst: Remark
     along_position: pd.DataFrame
     drift: Drift
 
-    def remarks(self) -> Iterator[Remark]:
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
         """Where the model fails most, by how much, and what drifts."""
-        table = self.by_condition
-        worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
-        # What names a condition: its pressure, and payload and vine where they vary
-        varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
-        condition = {"unit": self.pressure_unit} | {name: worst[name] for name in ("pressure_Pa", *varying)}
-        numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m")}
-        yield remark("fails_most", condition=condition, **numbers)
-        yield from self.drift.remarks
+        return self.worst, *self.drift.remarks
 
 
 def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails."""
     aligned = align_trials(fit)
     along = _residual_along_growth(aligned)
-    rows = [_condition_row(together, along) for together in aligned.together.values()]
-    return Failure(
-        pressure_unit=fit.trials[0].trial.pressure_unit,
-        by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_position=along,
-        drift=drift(fit, aligned),
-    )
+    return Failure(_worst_condition(aligned, along), along, drift(fit, aligned))
 
 
-def _condition_row(together: Replicates, along: pd.DataFrame) -> Row:
-    """Errors of a condition, and the mean residual of the stretch where that is largest, with its standard error."""
-    errors, trial = position_errors(together), together.trials[0].trial
+def _worst_condition(aligned: AlignedTrials, along: pd.DataFrame) -> Remark:
+    """The condition with the largest root mean square, which all pages call the worst, and the mean residual of the
+    stretch where that is largest, with its standard error.
+    """
+    together = max(aligned.together.values(), key=lambda replicates: rms_of(replicates.trials))
+    trial, trials = together.trials[0].trial, [trial.trial for trial in aligned.trials]
     stretches = along[along["condition"] == trial.condition]
     worst = stretches.iloc[int(stretches["mean_residual_m"].abs().argmax())]
-    return {
-        "vine": trial.vine,
-        "condition": trial.condition,
-        "pressure_Pa": trial.pressure_Pa,
-        "payload_kg": trial.payload_kg,
-        "rms_m": errors["rms_position_m"],
-        "floor_m": errors["replicate_floor_m"],
-        "worst_residual_m": float(worst["mean_residual_m"]),
-        "worst_sigma_m": float(worst["sigma_m"]),
-    }
+    # What names a condition: its pressure, and payload and vine where they vary
+    varying = [name for name in ("payload_kg", "vine") if len({getattr(one, name) for one in trials}) > 1]
+    return remark(
+        "fails_most",
+        condition={"unit": trial.pressure_unit} | {name: getattr(trial, name) for name in ("pressure_Pa", *varying)},
+        rms_m=rms_of(together.trials),
+        floor_m=together.floor_m,
+        worst_residual_m=float(worst["mean_residual_m"]),
+        worst_sigma_m=float(worst["sigma_m"]),
+    )
 
 
 def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
