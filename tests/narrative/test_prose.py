@@ -19,7 +19,6 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     EffectPower,
     FurtherTrials,
-    NumberWidth,
     Power,
     PowerInput,
     Round,
@@ -72,7 +71,10 @@ POWER = Power(
     n_trials=6, false_alarm_rate=0.0042,
     effects=(effect("fold_inertia", "η", 0.7, 1.0), effect("air_drag", "C_D", 150.0, 3.0)),
     not_testable={"payload_drag": remark("column_blank", column="payload_g")}, model=("gravity", "eversion_damping"),
-    numbers=(NumberWidth("n", "", 0.37, 0.0075), NumberWidth("B", "tube", 6.4, 0.034)),
+    numbers=(
+        Number("eversion_damping.n", "", "n", "1", 0.37, 0.0037, 0.3625, 0.3775),
+        Number("eversion_damping.B", "tube", "B", "", 6.4, 0.11, 6.4 * 0.966, 6.4 * 1.034),
+    ),
     inputs=(PowerInput("frame rate", "1069 /s", "sheet"),),
 )  # fmt: skip
 

@@ -43,7 +43,6 @@ from vinetrack.diagnosis.result import (
     ADEQUATE,
     PROBABILITIES,
     EffectPower,
-    NumberWidth,
     Power,
     PowerInput,
     SimulatedRates,
@@ -167,7 +166,7 @@ def power_of(
         false_alarm_rate=_false_alarm_rate(tests.fit),
         effects=tuple(power for power in powers if power is not None),
         not_testable={**(not_testable or {}), **dict.fromkeys(tests.products.silent, remark("no_response"))},
-        numbers=_interval_widths(tests.fit),
+        numbers=tuple(number for number in tests.fit.numbers if number.key in (DAMPING, EXPONENT)),
         inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
         wary=remark("excess_counted_as_noise") if exceeds_slow_errors(tests.fit) else Remark(),
@@ -354,17 +353,6 @@ def _false_alarm_rate(fit: Fit) -> float:
     level, trials = FALSE_ALARM_LEVEL_FIRST_ROUND, [trial.trial for trial in fit.trials]
     stated = any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials)
     return level + min(PROBE_LEVEL, level) + 0.1 * level + level * stated
-
-
-def _interval_widths(fit: Fit) -> tuple[NumberWidth, ...]:
-    """Half widths of the 95 % intervals of n and of every B, relative for B."""
-    widths = []
-    for number in fit.numbers:
-        half, symbol = (number.high - number.low) / 2, {DAMPING: "B", EXPONENT: "n"}.get(number.key)
-        if symbol and math.isfinite(half):
-            relative = half / number.value if symbol == "B" and number.value > 0 else half
-            widths.append(NumberWidth(symbol, number.vine, number.value, relative))
-    return tuple(widths)
 
 
 # ------------------------------------------------------------------------------

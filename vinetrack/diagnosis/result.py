@@ -92,16 +92,6 @@ class EffectPower(JsonRecord):
 
 
 @dataclass(frozen=True)
-class NumberWidth(JsonRecord):
-    """Half width of the 95 % interval of a fitted parameter: relative for B, absolute for n."""
-
-    name: str
-    vine: str
-    value: OrNaN
-    half_width: OrNaN
-
-
-@dataclass(frozen=True)
 class PowerInput:
     """A quantity that the power was computed with, in words, and where it comes from: the fit, the user, or a prior."""
 
@@ -187,7 +177,8 @@ StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSeriali
 
 @dataclass(frozen=True)
 class Power(Drawn, JsonRecord):
-    """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
+    """Which effects the trials of a campaign can detect, at which sizes, and `numbers`, the damping law that they
+    determine. Printed, it is the text on the terminal.
     The probability of any false alarm is at most `false_alarm_rate`.
     """
 
@@ -195,7 +186,7 @@ class Power(Drawn, JsonRecord):
     false_alarm_rate: OrNaN = math.nan
     effects: tuple[EffectPower, ...] = ()
     not_testable: Annotated[Mapping[str, StoredRemark], Field(alias="not_testable_codes")] = field(default_factory=dict)
-    numbers: tuple[NumberWidth, ...] = ()
+    numbers: tuple[Number, ...] = ()
     inputs: tuple[PowerInput, ...] = ()
     model: tuple[str, ...] = ()
     wary: Annotated[StoredRemark, Field(alias="wary_code")] = field(default_factory=Remark)

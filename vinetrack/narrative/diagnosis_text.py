@@ -14,6 +14,7 @@ from vinetrack.core.terminal import table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
 from vinetrack.diagnosis.result import EXPECTED, NOT_TESTABLE, Diagnosis, Round
 from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.inference.fit_result import DAMPING
 from vinetrack.narrative import sentence
 from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
@@ -75,10 +76,11 @@ def power_lines(power: Power) -> list[str]:
     lines += table(listed, POWER_COLUMNS, indent="  ", align="<" * len(POWER_COLUMNS))
     lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
     lines.append(sentence("false_alarms", {"rate": power.false_alarm_rate}))
-    if power.numbers:
-        halves = [percent(one.half_width) if one.name == "B" else number(one.half_width, 2) for one in power.numbers]
-        names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
-        lines.append(f"95 % intervals: {', '.join(map(' ± '.join, zip(names, halves, strict=True)))}.")
+    halves = [(one, (one.high - one.low) / 2) for one in power.numbers if math.isfinite(one.high - one.low)]
+    widths = [
+        f"{one.title} ± {percent(half / one.value) if one.key == DAMPING else number(half, 2)}" for one, half in halves
+    ]
+    lines += [f"95 % intervals: {', '.join(widths)}."] if widths else []
     for plan in power.further:
         lines += ["", *further_lines(plan)]
     return lines + simulated_lines(power)
