@@ -98,18 +98,18 @@ Criterion = Callable[..., Floats]  # Worth of designs, shape (n_designs,), by th
 
 def conditions_by_effort(
     conditions: Sequence[Condition], best_new_vines: Callable[[NDArray[np.intp]], Sequence[str]]
-) -> Iterator[tuple[int, NDArray[np.intp]]]:
+) -> Iterator[NDArray[np.intp]]:
     """Yield the indices of the conditions to choose from with more and more effort: on the rig so far, with another
     rig as well, and with one new vine at a time as well, of those that `best_new_vines` chooses among their indices.
     """
     efforts = np.array([condition.effort for condition in conditions])
     for effort in (SAME_RIG, OTHER_RIG):
         if (efforts == effort).any():
-            yield effort, np.flatnonzero(efforts <= effort)
+            yield np.flatnonzero(efforts <= effort)
     new = np.flatnonzero(efforts == NEW_VINE)
     for vine in best_new_vines(new) if new.size else ():
         vines = np.array([condition.trial.vine for condition in conditions])
-        yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
+        yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
 def added_one_by_one(allowed: NDArray[np.intp], worth: Criterion, most: int) -> list[int]:
@@ -236,7 +236,7 @@ def _best_option(
 
     options: list[tuple[list[Condition], Floats]] = []
     before = -math.inf
-    for _, allowed in conditions_by_effort(conditions, best_vines):
+    for allowed in conditions_by_effort(conditions, best_vines):
         design = sorted(added_one_by_one(allowed, worth_of, limits.trials))
         predicted = float(worth_of(design)[0])
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
@@ -401,7 +401,7 @@ def further_trials(
         return [max(known, key=lambda vine: known[vine])]
 
     chosen, power = list[int](), cache(lambda _: now)
-    for _, allowed in conditions_by_effort(conditions, best_vine):
+    for allowed in conditions_by_effort(conditions, best_vine):
         pairs = added_one_by_one(allowed, information, most)
         if not pairs:
             continue
