@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (693, 4, 5),
     "core": (948, 7, 25),
-    "diagnosis": (5996, 14, 90),
+    "diagnosis": (5813, 14, 89),
     "dynamics": (2277, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
@@ -39,7 +39,7 @@ BUDGETS = {
     "narrative": (1070, 3, 8),
     "pages": (2815, 7, 22),
     "paper": (891, 4, 35),
-    "pipeline": (1991, 7, 6),
+    "pipeline": (1990, 7, 6),
     "planning": (1583, 4, 24),
     "report": (746, 3, 4),
     "results": (475, 4, 9),

@@ -455,7 +455,7 @@ class RankedLaw:
     @property
     def words(self) -> str:
         """Description of the law with its amplitude."""
-        return str(remark("law", law=self.law, amplitude_N=self.amplitude_N, sigma_N=self.estimate.sigma))
+        return str(remark("law", symbols=self.law.symbols, size=(self.amplitude_N, self.estimate.sigma)))
 
     @property
     def row(self) -> dict[str, Any]:

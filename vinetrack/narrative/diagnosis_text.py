@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
-    from vinetrack.diagnosis.missing_force import Law, LearnedForce
+    from vinetrack.diagnosis.missing_force import LearnedForce
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.diagnosis.result import EffectPower, FurtherTrials, Power
     from vinetrack.inference.fit_result import Fit
@@ -299,19 +299,10 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     return lines + [f"! {message}" for message in after.messages]
 
 
-# ------------------------------------------------------------------------------
-# Simple laws of a missing force.
-
-
-def law_text(law: Law, amplitude_N: float, sigma_N: float) -> str:
-    """Describe a law of force with its size at its largest."""
+def _newtons(amplitude_N: float, sigma_N: float) -> str:
+    """Return a force with its sign and standard error."""
     error = with_error(amplitude_N, sigma_N) if math.isfinite(sigma_N) else number(amplitude_N)
-    size = f"{'+' if amplitude_N > 0 else ''}{error} N".replace("-", "−")
-    return (
-        f"a force in proportion to {law.symbols}, {size} at its largest"
-        if law.factors
-        else f"a constant force of {size}"
-    )
+    return f"{'+' if amplitude_N > 0 else ''}{error} N".replace("-", "−")
 
 
 # ------------------------------------------------------------------------------
@@ -471,6 +462,7 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "pressure": lambda pressure_in: pressure_text(*pressure_in),
     "condition": lambda condition: _condition_text(**condition),
     "variables": _variables_text,
+    "newtons": lambda force_N: _newtons(*force_N),
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
     "draws": lambda share: "in every draw" if share > 0.995 else f"in {share:.0%} of the draws",
     "spaced": lambda name: name.replace("_", " "),
@@ -507,7 +499,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         if (words := " ".join(filter(None, (one.told_apart, one.remedy))))
     ),
     "trials_to_make": advice_text,
-    "law": law_text,
     "fails_most": fails_most_text,
     "drifts": drift_text,
     "learned_force": learned_force_text,
