@@ -70,6 +70,7 @@ def _worst_condition(aligned: AlignedTrials, along: pd.DataFrame) -> Remark:
     trial, trials = together.trials[0].trial, [trial.trial for trial in aligned.trials]
     stretches = along[along["condition"] == trial.condition]
     worst = stretches.iloc[int(stretches["mean_residual_m"].abs().argmax())]
+    off_m = float(worst["mean_residual_m"]), float(worst["sigma_m"])
     # What names a condition: its pressure, and payload and vine where they vary
     varying = [name for name in ("payload_kg", "vine") if len({getattr(one, name) for one in trials}) > 1]
     return remark(
@@ -77,8 +78,9 @@ def _worst_condition(aligned: AlignedTrials, along: pd.DataFrame) -> Remark:
         condition={"unit": trial.pressure_unit} | {name: getattr(trial, name) for name in ("pressure_Pa", *varying)},
         rms_m=rms_of(together.trials),
         floor_m=together.floor_m,
-        worst_residual_m=float(worst["mean_residual_m"]),
-        worst_sigma_m=float(worst["sigma_m"]),
+        is_repeated=math.isfinite(together.floor_m),
+        off_m=off_m,
+        is_ahead=off_m[0] > 0,
     )
 
 

@@ -315,14 +315,6 @@ def _condition_text(pressure_Pa: float, unit: str, payload_kg: float | None = No
     return f"{pressure_text(pressure_Pa, unit)}{load}{f' ({vine})' if vine else ''}"
 
 
-def fails_most_text(worst_residual_m: float, worst_sigma_m: float, **facts: Any) -> str:
-    """Return where a model fails most, and by how much."""
-    digits = decimals(1e3 * worst_sigma_m)
-    off = f"{1e3 * abs(worst_residual_m):.{digits}f} ± {1e3 * worst_sigma_m:.{digits}f} mm"
-    facts |= {"off": off, "is_ahead": worst_residual_m > 0, "is_repeated": math.isfinite(facts["floor_m"])}
-    return sentence("fails_most_at", facts)
-
-
 def drift_condition(column: str, pressure_unit: str = "kPa") -> tuple[str, str, float]:
     """Return name, unit and factor from SI of a condition that a parameter may drift with."""
     for known in COLUMNS.values():
@@ -461,6 +453,7 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "remedy": lambda source: SHARED_REMEDIES[source],
     "pressure": lambda pressure_in: pressure_text(*pressure_in),
     "condition": lambda condition: _condition_text(**condition),
+    "off": lambda off_m: f"{with_error(*(1e3 * abs(m) for m in off_m))} mm",
     "variables": _variables_text,
     "newtons": lambda force_N: _newtons(*force_N),
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
@@ -499,7 +492,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         if (words := " ".join(filter(None, (one.told_apart, one.remedy))))
     ),
     "trials_to_make": advice_text,
-    "fails_most": fails_most_text,
     "drifts": drift_text,
     "learned_force": learned_force_text,
     "learned_file": learned_file_text,
