@@ -138,7 +138,7 @@ def test_a_row_that_contradicts_the_others_is_named_and_left_out(campaign):
     assert result.verdict == "adequate"
     assert [trial.name for trial in result.fit.trials] == [trial.name for trial, _ in campaign if trial.name != "t2"]
     (note,) = (note for note in result.notes if note.code == "odd_trials")
-    assert (note.facts["odd"][0].name, note.facts["count"]) == ("t2", 12)
+    assert (note.facts["odd"][0].name, note.facts["others"]) == ("t2", 11)
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
 
 

@@ -1,5 +1,6 @@
 """Prose stands in one room, a sentence for every code; one stored text of each kind shows a change of words."""
 
+import csv
 import math
 import re
 from dataclasses import replace
@@ -50,6 +51,12 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code():
     assert [code for code in REMARKS if not re.search(rf"""["']{code}["']""", source)] == []
     source += "".join(path.read_text(encoding="utf-8") for path in (PACKAGE / "narrative").glob("*_text.py"))
     assert [code for code in templates() if not re.search(rf"""["']{code}["']""", source)] == []
+
+
+def test_no_sentence_is_cut_at_a_comma():
+    """One about trials that contradict the others was."""
+    with (PACKAGE / "narrative" / "sentences.csv").open(encoding="utf-8", newline="") as file:
+        assert {len(row) for row in csv.reader(file)} == {2}
 
 
 def test_a_size_that_is_named_though_implausible_is_said_to_be_so_beside_it():

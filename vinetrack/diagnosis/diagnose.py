@@ -100,8 +100,9 @@ def diagnose(
             unfit.setdefault(reason, []).append(name)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
     if odd := odd_trials(fit.predictor.data):
-        told.append(remark("odd_trials", odd=odd, count=len(fit.trials)))
-        others = [pair for pair in pairs if pair[0].name not in {trial.name for trial in odd}]
+        names = [trial.name for trial in odd]
+        told.append(remark("odd_trials", odd=odd, names=names, others=len(fit.trials) - len(odd)))
+        others = [pair for pair in pairs if pair[0].name not in names]
         fit = initial_fit(model, others, effects)
     result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
     result = with_lost_frames(replace(result, odd_trials=tuple(trial.name for trial in odd)), dropped)

@@ -20,7 +20,6 @@ from vinetrack.narrative.verdict_text import (
     SHARED_REMEDIES,
     estimates_text,
     expected_text,
-    odd_in_words,
     percent,
     spaced_name,
     value_text,
@@ -452,6 +451,12 @@ FORMS: dict[str, Callable[[Any], str]] = {
     ),
     "remedy": lambda source: SHARED_REMEDIES[source],
     "pressure": lambda pressure_in: pressure_text(*pressure_in),
+    "implied": lambda odd: "".join(
+        f" {one.name} moves as at {pressure_text(one.implied_pressure_Pa, one.unit)}, but "
+        f"{pressure_text(one.stated_Pa, one.unit)} is stated."
+        for one in odd
+        if one.implied_pressure_Pa > 0
+    ),
     "condition": lambda condition: _condition_text(**condition),
     "off": lambda off_m: f"{with_error(*(1e3 * abs(m) for m in off_m))} mm",
     "variables": _variables_text,
@@ -485,7 +490,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
     ),
     "implausible_size": _implausible_text,
-    "odd_trials": odd_in_words,
     "deciding_measurements": lambda effects: " ".join(
         f"{one.name}: {words[0].lower()}{words[1:]}"
         for one in effects

@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
-from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error
+from vinetrack.core.units import decimals, display_unit, number, with_error
 from vinetrack.diagnosis.between_trials import BETWEEN, ORDER_DRIFT, SPECIMEN
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.result import (
@@ -34,7 +34,6 @@ from vinetrack.narrative import sentence
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.diagnose import OddTrial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
@@ -477,15 +476,3 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
     unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)
     facts = {"difference": hypothesis_in_words(unstated), "gain": unstated.delta_chi2}
     return f"{text} {sentence('trials_seem_to_differ', facts)}{remedies_in_words(step, [unstated])}"
-
-
-def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
-    """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
-    told = {
-        trial.name: [pressure_text(at_Pa, trial.unit) for at_Pa in (trial.implied_pressure_Pa, trial.stated_Pa)]
-        for trial in odd
-        if trial.implied_pressure_Pa > 0
-    }
-    pressures = [f" {name} moves as at {implied}, but {stated} is stated." for name, (implied, stated) in told.items()]
-    facts = {"names": [trial.name for trial in odd], "others": count - len(odd), "pressures": "".join(pressures)}
-    return sentence("are_odd", facts)
