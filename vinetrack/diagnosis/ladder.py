@@ -243,8 +243,14 @@ class ResidualCourse(NamedTuple):
 
 
 def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
-    """The course of one trial. Responses are orthogonal to those to release and origin."""
-    trial_data, columns = aligned.predictor.data[i], aligned.columns[i]
+    """The course of one trial. Responses are orthogonal to those to release and origin. Where growth has ended in the
+    model they would be zero, but the vine may still grow: the last values are kept.
+    """
+    trial_data, columns = aligned.predictor.data[i], aligned.columns[i].copy()
+    moving = np.flatnonzero(columns[:, RELEASE] != 0)
+    if moving.size:
+        kept = [RELEASE, PRESSURE, DAMPING_DEVIATION]
+        columns[moving[-1] + 1 :, kept] = columns[moving[-1], kept]
     response = orthogonal_part(columns[:, [PRESSURE, DAMPING_DEVIATION]], columns[:, aligned.nuisances(i)])
     moved = slice(first_that_counts(trial), None)
     return ResidualCourse(

@@ -398,7 +398,7 @@ class Scores:
         with np.errstate(divide="ignore", invalid="ignore"):
             robust_t = np.where(self.robust_sigma > 0, allowed_size / self.robust_sigma, np.inf)
             log_tail = np.log(stdtr(max(self.degrees, 3.0), -robust_t))
-        return np.asarray(np.minimum(z, -ndtri_exp(log_tail)))
+        return np.asarray(np.minimum(z, np.abs(ndtri_exp(log_tail))))
 
     @property
     def cosines(self) -> Floats:
