@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (693, 4, 5),
     "core": (948, 7, 25),
-    "diagnosis": (5813, 14, 89),
+    "diagnosis": (5822, 14, 89),
     "dynamics": (2277, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
@@ -36,7 +36,7 @@ BUDGETS = {
     "interface": (567, 2, 2),
     "kinematics": (1618, 6, 12),
     "laboratory": (1600, 6, 9),
-    "narrative": (1070, 3, 8),
+    "narrative": (1048, 3, 8),
     "pages": (2815, 7, 22),
     "paper": (891, 4, 35),
     "pipeline": (1990, 7, 6),
