@@ -291,7 +291,8 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 @dataclass(frozen=True)
 class Products:
     """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the fit's
-    noise, shape (n_trials, n_columns, n_columns). `problem` is that of the fit with the systematic errors as further
+    noise, shape (n_trials, n_columns, n_columns); the residual is taken with the trial effects at their prior means.
+    `problem` is that of the fit with the systematic errors as further
     parameters; `silent` names the effects to which no trajectory responds at any plausible size.
     """
 
@@ -312,8 +313,7 @@ class Products:
 
     def without_trial_effects(self, state: FitState) -> Floats:
         """Those of unknowns, residual and shapes, the trial effects integrated out."""
-        restored = at_prior_means(self.white, self.problem, state, self.problem.n_effects + self.n_unknowns)
-        return eliminated(restored, trial_effect_prior(self.problem, state)[1])[0]
+        return eliminated(self.white, trial_effect_prior(self.problem, state)[1])[0]
 
 
 def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
@@ -326,13 +326,15 @@ def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
 def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
     """Cross products of a fit, of its systematic errors and of the candidates; no trial's columns are held twice."""
     responses, silent = _sensitivities(fit, shapes)
-    systematics, white = systematics_of(fit.predictor, fit.solution), list[Floats]()
+    systematics = systematics_of(fit.predictor, fit.solution)
+    problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
+    residual = problem.n_effects + problem.index.shape[1]
+    white = np.empty((len(fit.trials), *2 * (residual + 1 + len(responding),)))
     for i, of_fit in enumerate(systematics.beside(fit.solution.columns)):
-        white.append(in_noise(fit, i, np.column_stack([of_fit, *(moved[i] for _, moved in responses)])))
+        white[i] = in_noise(fit, i, np.column_stack([of_fit, *(moved[i] for _, moved in responses)]))
         for _, moved in responses:
             moved[i] = np.empty(0)
-    problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
-    return Products(np.stack(white), problem, responding, tuple(silent))
+    return Products(at_prior_means(white, problem, fit.state, residual), problem, responding, tuple(silent))
 
 
 @dataclass(frozen=True)

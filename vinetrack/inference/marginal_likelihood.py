@@ -329,7 +329,8 @@ def eliminated(blocks: Floats, precision: Floats) -> tuple[Floats, Floats]:
     """
     m = precision.shape[1]
     response = solve_per_trial(with_diagonal(blocks[:, :m, :m], precision), blocks[:, :m, m:])
-    return blocks[:, m:, m:] - blocks[:, m:, :m] @ response, response
+    explained = blocks[:, m:, :m] @ response
+    return np.subtract(blocks[:, m:, m:], explained, out=explained), response
 
 
 def with_diagonal(square: Floats, diagonal: Floats) -> Floats:
@@ -351,24 +352,23 @@ def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: Mixed
 
 
 def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
-    """Cross products with the residual taken at zero deviations of pressure and ln B, and errors of single trials,
-    instead of the current ones, and with what the priors of release and origin add: their pull, and their penalty at
-    the current values. Shapes: white (n_trials, k, k) → (n_trials, k, k).
+    """Cross products, changed in place: the residual is taken at zero deviations of pressure and ln B, and errors of
+    single trials, instead of the current ones, and the priors of release and origin add their pull, and their penalty
+    at the current values. Shapes: white (n_trials, k, k).
     """
     columns = list(range(PRESSURE, state.trial_effects.shape[1]))
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
-    restored = white.copy()
-    restored[:, :, residual] += explained
-    restored[:, residual, :] = restored[:, :, residual]
+    white[:, :, residual] += explained
+    white[:, residual, :] = white[:, :, residual]
     # With r' = r + Z d, the product r'ᵀr' has the cross term rᵀZd twice, and dᵀZᵀZd.
-    restored[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
+    white[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
     offset = state.trial_effects[:, :2] - problem.release_origin_mean
     pull = problem.release_origin_precision * offset
-    restored[:, :2, residual] -= pull
-    restored[:, residual, :2] -= pull
-    restored[:, residual, residual] += np.sum(pull * offset, axis=1)
-    return np.asarray(restored)
+    white[:, :2, residual] -= pull
+    white[:, residual, :2] -= pull
+    white[:, residual, residual] += np.sum(pull * offset, axis=1)
+    return white
 
 
 # ------------------------------------------------------------------------------
