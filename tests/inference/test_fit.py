@@ -23,12 +23,12 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import optimiser, solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
-from vinetrack.inference.gaussian_processes import products, whiten
+from vinetrack.inference.gaussian_processes import products
 from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
-from vinetrack.inference.trial_effects import trial_costs, white_at_releases
+from vinetrack.inference.trial_effects import trial_costs
 from vinetrack.interface.loaded import ERROR_COLUMNS
 from vinetrack.tracks.position_noise import rest_points
 
@@ -586,19 +586,6 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion,
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
     found = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
     assert found.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_columns_at_a_release_are_the_shifted_and_whitened_ones(rho):
-    draw = np.random.default_rng(5)
-    time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
-    curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
-    first, releases_s = np.isin(np.arange(41), [0, 17]), np.array([-0.2, 0.0, 0.013, 0.25])
-    columns_at = white_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
-    for release_s, at in zip(releases_s, columns_at, strict=True):
-        columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
-        columns[:, -1] = position_m - columns[:, -1]
-        assert np.allclose(at.T, whiten(columns, first, rho, relative), rtol=1e-12, atol=1e-12)
 
 
 def test_a_fit_converges_from_its_own_solution(only_in_motion):

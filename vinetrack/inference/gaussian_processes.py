@@ -46,15 +46,14 @@ def at_correlation(cross_products: Floats, rho: float) -> Floats:
 
 def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: Floats | None = None) -> Floats:
     """Whiten residuals or columns under AR(1) noise; the first point of a stretch has the same variance as others.
-    Shapes: residual, first, relative_sd (n_points,).
+    Shapes: residual (n_points, …); first, relative_sd (n_points,).
     """
     if relative_sd is not None:
-        residual = residual / (relative_sd if residual.ndim == 1 else relative_sd[:, None])
+        residual = (residual.T / relative_sd).T
     white = residual.copy()
-    rows, earlier = (np.swapaxes(values, 0, 1) if values.ndim == 3 else values for values in (white, residual))
     with_predecessor = np.flatnonzero(~first)
-    rows[with_predecessor] -= rho * earlier[with_predecessor - 1]
-    rows[first] *= np.sqrt(1 - rho**2)
+    white[with_predecessor] -= rho * residual[with_predecessor - 1]
+    white[first] *= np.sqrt(1 - rho**2)
     return white
 
 

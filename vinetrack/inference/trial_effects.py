@@ -7,7 +7,6 @@ a trajectory depends only on the time since release, one simulation, shifted in 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import njit
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
@@ -36,51 +34,6 @@ from vinetrack.inference.sensitivity import (
     Jobs,
     Predictor,
 )
-
-# ------------------------------------------------------------------------------
-# Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
-#
-# A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was
-# three quarters of the time of a fit that continues from another.
-
-
-@njit(nogil=True, error_model="numpy")
-def white_at_releases(
-    time_s: Floats,
-    position_m: Floats,
-    first: NDArray[np.bool_],
-    relative_sd: Floats,
-    releases_s: Floats,
-    grid_s: Floats,
-    curves: Floats,
-    rho: float,
-) -> Floats:
-    """Whitened columns and residual of a trial for each candidate release, as `whiten` makes them. Curves are
-    interpolated linearly, and constant beyond the ends of the grid. The last column is the residual. Shapes: time_s,
-    position_m, first, relative_sd (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) →
-    (n_releases, n_columns, n_points).
-    """
-    count, size, last = len(curves), len(time_s), len(grid_s) - 1
-    begins = math.sqrt(1 - rho**2)
-    plain, white = np.empty((count, size)), np.empty((len(releases_s), count, size))
-    for r in range(len(releases_s)):
-        j = 0
-        for i in range(size):
-            since_s = min(max(time_s[i] - releases_s[r], 0.0), grid_s[last])
-            while j < last - 1 and grid_s[j + 1] <= since_s:
-                j += 1
-            part = (since_s - grid_s[j]) / (grid_s[j + 1] - grid_s[j])
-            for c in range(count):
-                plain[c, i] = curves[c, j] + part * (curves[c, j + 1] - curves[c, j])
-            plain[count - 1, i] = position_m[i] - plain[count - 1, i]
-        for c in range(count):
-            before = 0.0
-            for i in range(size):
-                value = plain[c, i] / relative_sd[i]
-                white[r, c, i] = begins * value if first[i] else value - rho * before
-                before = value
-    return white
-
 
 # ------------------------------------------------------------------------------
 # Restriction of a fit to a subset of its trials: free parameters, predictor, state and problem.
@@ -248,10 +201,12 @@ def _best_release(
     """
     centre, precision = prior
     rho, variance = noise
-    relative = trial_data.point_sd
-    position_m = trial_data.lead_position_m - trial_effects[ORIGIN]
-    curves = np.vstack([sensitivities, plain])
-    white = white_at_releases(trial_data.time_s, position_m, trial_data.first, relative, releases, times, curves, rho)
+    # Sensitivities and residual at every point for each release, shape (n_points, n_releases, 5), and whitened
+    place = np.interp(trial_data.time_s[:, None] - releases, times, np.arange(times.size))
+    before, curves = np.minimum(place.astype(int), times.size - 2), np.column_stack([*sensitivities, plain])
+    columns = curves[before] + (place - before)[..., None] * np.diff(curves, axis=0)[before]
+    columns[..., -1] = (trial_data.lead_position_m - trial_effects[ORIGIN])[:, None] - columns[..., -1]
+    white = whiten(columns, trial_data.first, rho, trial_data.relative_sd).transpose(1, 2, 0)
     square = white @ np.swapaxes(white, 1, 2) / variance
     effects = np.tile(trial_effects, (releases.size, 1))
     effects[:, RELEASE] = releases
