@@ -117,10 +117,17 @@ class FitTrial:
 
     @property
     def rest_origin_m(self) -> float:
-        """Position of the edge at rest before the motion, m: the mean of its points where they are in the fit."""
+        """Position of the edge at rest before the motion, m: the mean of its points but the last, where they are in the
+        fit.
+        """
         if self.imprecise_rest is not None:
             return self.imprecise_rest.origin_m
-        return float(np.mean(self.lead_position_m[: self.n_rest]))
+        return float(np.mean(self.lead_position_m[: max(self.n_rest - 1, 1)]))
+
+    @property
+    def rest_end_s(self) -> float:
+        """Time of the last frame at rest before the motion, s; of the first where none shows it."""
+        return self.imprecise_rest.release_s if self.imprecise_rest else float(self.time_s[max(self.n_rest - 1, 0)])
 
     @cached_property
     def typical_pressure_Pa(self) -> float:

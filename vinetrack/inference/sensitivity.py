@@ -138,28 +138,11 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     change = np.asarray(moved.observed_position_m - plain.observed_position_m)
     if plain.status == "ended":
         change[plain.time_s > plain.end_time_s] = change[-1] if moved.status == "ended" else 0.0
-    plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
-    early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
-    last = int(np.argmax(early)) - 1
-    if early.any() and last >= 0:
-        # A small perturbation ends growth earlier by displacement over speed. Where the unperturbed motion takes much
-        # longer than that, the two motions differ in kind (one stops before the end), and nothing is extrapolated.
-        speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
-        # 3.0: time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay
-        # that the perturbation causes (derived)
-        reach_s = plain.time_s[last] + 3.0 * abs(float(change[last])) / speed_m_s
-        early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
-        if early.any():
-            faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
-            change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
     return change
 
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relative deviation of pressure (defined)
-
-
-RELEASE_STEP_FRAMES = 0.1  # Step of the release (chosen)
 
 
 class Predictor:
@@ -354,7 +337,8 @@ class Predictor:
         """
         damping_step = 1e-3 * side  # Relative step of B (derived)
         if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
-            steps, perturbed = side * RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed[shifted_trials]
+            # 0.1: step of the release, frames (chosen)
+            steps, perturbed = side * 0.1 * self.frames_s[shifted_trials], unperturbed[shifted_trials]
             yield RELEASE, steps, replace(perturbed, release_s=perturbed.release_s + steps)
         if len(pressure_trials := np.flatnonzero(self.has_pressure_deviation)):
             steps, perturbed = side * self.pressure_step[pressure_trials], unperturbed[pressure_trials]
@@ -390,23 +374,11 @@ def _adapted_steps(response: Floats, previous: Floats) -> Floats:
 # Starting values of a fit: release and origin from the frames at rest, B from a coarse search.
 
 
-POINTS_USED = 60  # Points of each trial that the search uses (chosen)
-
-
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     """Release and origin of every trial from its frames at rest; zero deviations. Shape (n_trials, 4)."""
     trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
     for i, trial_data in enumerate(data):
-        if trial_data.n_rest > 0:
-            trial_effects[i, RELEASE] = trial_data.time_s[trial_data.n_rest - 1]
-            trial_effects[i, ORIGIN] = np.mean(trial_data.lead_position_m[: max(trial_data.n_rest - 1, 1)])
-        elif trial_data.imprecise_rest is not None:
-            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = (
-                trial_data.imprecise_rest.release_s,
-                trial_data.imprecise_rest.origin_m,
-            )
-        else:
-            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = trial_data.time_s[0], trial_data.lead_position_m[0]
+        trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = trial_data.rest_end_s, trial_data.rest_origin_m
         if trial_data.pressurised_in_recording:
             assert trial_data.trace is not None
             trial_effects[i, RELEASE] = min(trial_data.time_s[0], trial_data.trace[0][0])
@@ -456,7 +428,7 @@ def _with_best_damping(
 
 def middle_speed(trial_data: FitTrial) -> float:
     """Mean speed of the tail from 40 to 85 % of the observed growth. Returns above 0."""
-    y = trial_data.lead_position_m - trial_data.lead_position_m[: max(trial_data.n_rest, 1)].mean()
+    y = trial_data.lead_position_m - trial_data.rest_origin_m
     total = float(np.max(y))
     low, high = (int(np.argmax(y >= part * total)) for part in (0.4, 0.85))
     high = max(high, low + 1) if low + 1 < y.size else low
@@ -476,17 +448,16 @@ def align(
     data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> tuple[Floats, Floats]:
     """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
-    One trajectory per trial is simulated, at a subset of its frames, and shifted in time by interpolation. Returns
+    One trajectory per trial is simulated and shifted in time by interpolation. Returns
     trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,); trial_effects
     (n_trials, 4) → (n_trials, 4).
     """
-    subsets = [_thinned(trial_data) for trial_data in data]
     jobs = predictor.jobs(theta, trial_effects)
     durations = [
         trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
         for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
-    grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
+    grids = [np.linspace(0.0, duration, 240) for duration in durations]
     # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
     trajectories = simulate_many(
         predictor.layout.model,
@@ -500,7 +471,11 @@ def align(
         host=predictor.host,
     )
     best, misfit = trial_effects.copy(), np.zeros(len(data))
-    for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
+    for i, trial_data in enumerate(data):
+        begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
+        # 60: points that are compared, most of them in motion (chosen)
+        seen = np.unique(np.linspace(begin, trial_data.time_s.size - 1, 60).astype(int))
+        time_s, y = trial_data.time_s[seen], trial_data.lead_position_m[seen]
         if trial_data.pressurised_in_recording:
             shifts = np.zeros(1)
         elif trial_data.shows_rest:
@@ -516,10 +491,3 @@ def align(
         best[i, RELEASE], best[i, ORIGIN] = trial_effects[i, RELEASE] + shifts[k], origin[k]
         misfit[i] = 0.5 * np.log(square[k] / np.ptp(y) ** 2 + 1e-8)
     return best, misfit
-
-
-def _thinned(trial_data: FitTrial) -> tuple[Floats, Floats]:
-    """At most sixty points, most of them in motion."""
-    begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
-    take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_USED).astype(int))
-    return trial_data.time_s[take], trial_data.lead_position_m[take]
