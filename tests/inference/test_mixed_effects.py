@@ -229,7 +229,8 @@ def test_collinear_parameters_are_detected_and_the_later_one_is_left_where_it_is
     draw = np.random.default_rng(10)
     rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
     twice = np.column_stack([rows, rows[:, 1]])
-    step, _ = marginal.bounded_solve(twice.T @ twice, twice.T @ seen, given(1, 5, 5)[0], np.zeros(5))
+    far, free = np.full(5, np.inf), np.ones(5, dtype=bool)
+    step, _ = marginal.step_within_bounds(twice.T @ twice, twice.T @ seen, far, far, free)
     assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
     assert step[4] == pytest.approx(0.0, abs=1e-12)
 
@@ -250,8 +251,7 @@ def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed):
     free[seed % 6] = False
     # At their bounds from the start, near them, and free of them.
     theta = np.clip(draw.uniform(-2, 3, 6), -1, 2)
-    problem, _ = given(1, 5, 6, lower=np.full(6, -1.0), upper=np.full(6, 2.0), free=free)
-    step, _ = marginal.bounded_solve(square, slope, problem, theta)
+    step, _ = marginal.step_within_bounds(square, slope, theta + 1.0, 2.0 - theta, free)
     target = np.linalg.lstsq(columns.T, slope, rcond=None)[0]
     exact = lsq_linear(columns[:, free], target, (-1 - theta[free], 2 - theta[free]), tol=1e-14, method="bvls").x
     best = exact @ (2 * slope[free] - square[np.ix_(free, free)] @ exact)

@@ -37,7 +37,7 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def at_correlation(cross_products: Floats, rho: float) -> Floats:
+def at_correlation(cross_products: Floats, rho: float | Floats) -> Floats:
     """Whitened cross products at a given correlation, for innovations of variance 1. Shapes: cross_products (n_trials,
     3, k, k) → (n_trials, k, k).
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,34 +177,6 @@ def profiled(
     return deviances
 
 
-def noise_at_correlations(
-    cross_products: Floats,
-    prior_precision: Floats,
-    prior_gradient: Floats,
-    points: Floats,
-    rhos: Floats,
-    shared: float,
-) -> tuple[Floats, Floats, Floats]:
-    """Restricted likelihood and residual sums of squares of all trials at each noise correlation, trial effects fitted.
-    Returns scores (−2 ln of the restricted likelihood, profiled over the variances, without the term of the gaps),
-    squares, degrees (residual sums of squares and their degrees of freedom). Shapes: cross_products (n_trials, 3, m +
-    1, m + 1); prior_precision, prior_gradient (n_trials, m); points (n_trials,); rhos (n_rhos,) → (n_rhos,).
-    """
-    m, rho = prior_precision.shape[1], rhos[:, None, None, None]
-    white = cross_products[:, 0] - rho * cross_products[:, 1] + rho**2 * cross_products[:, 2]
-    residual, gradient = white[..., m, m], white[..., :m, m] - prior_gradient
-    scale = 1 / np.sqrt(np.einsum("...kk->...k", white)[..., :m] + prior_precision)
-    prior = prior_precision * scale**2 + RIDGE
-    information = scale[..., :, None] * white[..., :m, :m] * scale[..., None, :] + prior[..., None] * np.eye(m)
-    inverse = np.linalg.inv(information)
-    log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
-    dof = np.maximum(points - shared - m + np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1), 1.0)
-    explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
-    # 0.2: least part of the residual sum of squares that remains (chosen)
-    squares = np.maximum(residual - explained, 0.2 * residual)
-    return np.sum(dof * np.log(squares / dof) + log_det, axis=1), squares, dof
-
-
 LEAST_BETWEEN_TRIAL_SD = 1e-5  # Least between-trial standard deviation (chosen)
 
 DEVIATION_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
@@ -248,11 +220,6 @@ class MixedProblem:
         """Unknowns of each trial alone."""
         return N_TRIAL_EFFECTS + self.own_errors
 
-    def of_trials(self, trials: slice | NDArray[np.int_] | list[int]) -> MixedProblem:
-        """The problem of some of the trials, with all its parameters."""
-        arrays = "index has_deviation gauge_error release_reach_s release_origin_mean release_origin_precision points"
-        return replace(self, **{name: getattr(self, name)[trials] for name in (*arrays.split(), "stretches")})
-
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
     """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
@@ -277,12 +244,6 @@ def trial_deviation_sd(problem: MixedProblem, spread: Floats | tuple[float, floa
 def shared_penalty(problem: MixedProblem, state: FitState) -> float:
     """Contribution of the priors of the free parameters to the penalised sum of squares."""
     return float(np.sum(problem.prior_precision * (state.theta - problem.prior_mean) ** 2))
-
-
-def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
-    """Contribution of the priors of each trial's effects to the penalised sum of squares. Shape (n_trials,)."""
-    centre, precision = trial_effect_prior(problem, state)
-    return np.asarray(np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
 def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats, Floats, float]:
@@ -391,7 +352,8 @@ def levenberg_marquardt_step(
     of_keys = np.ascontiguousarray(white[:, problem.n_effects :, problem.n_effects :])
     undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
     square = information + np.diag(damping * np.diag(undamped[0]))
-    step, _ = bounded_solve(square, slope, problem, state.theta)
+    room = state.theta - problem.lower, problem.upper - state.theta
+    step, _ = step_within_bounds(square, slope, *room, problem.free)
     step_of_keys = np.append(step, 0.0)[problem.index]
     trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
     # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
@@ -432,15 +394,6 @@ def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: F
     white[:, : problem.n_effects, -1] -= precision * (state.trial_effects - centre)
     white[:, -1, : problem.n_effects] = white[:, : problem.n_effects, -1]
     return white
-
-
-def bounded_solve(
-    square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """`step_within_bounds` of the parameters of a problem. Shapes: square (n_free, n_free); slope, theta (n_free,)."""
-    if not slope.size:
-        return slope, problem.free
-    return step_within_bounds(square, slope, theta - problem.lower, problem.upper - theta, problem.free)
 
 
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
@@ -559,16 +512,30 @@ def estimate_noise(
     3, k, k) → (n_trials,).
     """
     centre, precision = trial_effect_prior(problem, state)
-    precision_scaled = precision * state.variance[:, None]
-    prior_gradient = precision_scaled * (state.trial_effects - centre)
-    columns = [*range(problem.n_effects), cross_products.shape[-1] - 1]
+    prior_precision, m = precision * state.variance[:, None], problem.n_effects
+    prior_gradient = prior_precision * (state.trial_effects - centre)
+    columns = [*range(m), cross_products.shape[-1] - 1]
     of_effects = cross_products[:, :, columns][:, :, :, columns]
     shared = np.count_nonzero(problem.free) / problem.index.shape[0]
 
     def at(rhos: Floats) -> tuple[Floats, Floats, Floats]:
-        how = precision_scaled, prior_gradient, problem.points, rhos, shared
-        scores, squares, degrees = noise_at_correlations(of_effects, *how)
-        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), squares, degrees
+        """−2 ln of the restricted likelihood, profiled over the variances, at each correlation; residual sums of
+        squares and their degrees of freedom, shape (n_rhos, n_trials).
+        """
+        white = at_correlation(of_effects, rhos[:, None, None, None])
+        residual, gradient = white[..., m, m], white[..., :m, m] - prior_gradient
+        scale = 1 / np.sqrt(np.einsum("...kk->...k", white)[..., :m] + prior_precision)
+        prior = prior_precision * scale**2 + RIDGE
+        information = scale[..., :, None] * white[..., :m, :m] * scale[..., None, :] + prior[..., None] * np.eye(m)
+        inverse = np.linalg.inv(information)
+        log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
+        kept = np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1)
+        dof = np.maximum(problem.points - shared - m + kept, 1.0)
+        explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
+        # 0.2: least part of the residual sum of squares that remains (chosen)
+        squares = np.maximum(residual - explained, 0.2 * residual)
+        scores = np.sum(dof * np.log(squares / dof) + log_det, axis=1)
+        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), squares, dof
 
     if rho is None:
         low, high = CORRELATIONS

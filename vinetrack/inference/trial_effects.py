@@ -19,7 +19,6 @@ from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
-    trial_effect_penalty,
     trial_effect_prior,
     trial_effect_step,
     whitened_products,
@@ -38,11 +37,9 @@ from vinetrack.inference.sensitivity import (
 # ------------------------------------------------------------------------------
 # Restriction of a fit to a subset of its trials: free parameters, predictor, state and problem.
 
-Indices = NDArray[np.int_]
-
 
 def subset(
-    predictor: Predictor, problem: MixedProblem, rows: Indices, *states: FitState
+    predictor: Predictor, problem: MixedProblem, rows: NDArray[np.int_], *states: FitState
 ) -> tuple[Predictor, MixedProblem, list[FitState]]:
     """Predictor, with the finite-difference steps of the other, problem and states of some trials and of the parameters
     that apply to one of them; names, scales and priors are unchanged.
@@ -70,10 +67,12 @@ def subset(
     smaller.is_central = predictor.is_central
     smaller.has_pressure_deviation = predictor.has_pressure_deviation[rows]
     smaller.has_damping_deviation = predictor.has_damping_deviation[rows]
+    by_trial = "has_deviation gauge_error release_reach_s release_origin_mean release_origin_precision points stretches"
     by_parameter = "prior_mean prior_precision lower upper free random"
     problem = replace(
-        problem.of_trials(rows),
+        problem,
         index=layout.index,
+        **{name: getattr(problem, name)[rows] for name in by_trial.split()},
         **{name: getattr(problem, name)[places] for name in by_parameter.split()},
     )
     reduced = [
@@ -118,7 +117,8 @@ def trial_costs(
         residuals = predictor.residuals(state.theta, state.trial_effects)
     white = whiten(residuals, predictor.first, state.rho, predictor.relative_sd)
     squares = np.add.reduceat(white**2, predictor.starts[:-1])
-    return np.asarray(squares / state.variance + trial_effect_penalty(problem, state))
+    centre, precision = trial_effect_prior(problem, state)
+    return np.asarray(squares / state.variance + np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
 def residuals_in(columns: Sequence[Floats]) -> Floats:
@@ -133,39 +133,28 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
     """The state with releases at which the trials' likelihoods, their effects integrated out, are higher; None if there
-    are none. Of trials pressurised during the recording the trace shows the release.
+    are none. They are proposed by the linear model, and kept where they remain better after a few steps on simulated
+    trajectories. Of trials pressurised during the recording the trace shows the release.
     """
-    proposed = _by_linear_model(predictor, problem, state)
-    accepted = state if proposed is None else _confirmed(predictor, problem, state, proposed)
-    return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
-
-
-def _by_linear_model(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
-    """The state with each trial at its likeliest release by the linear model; None if no trial moves."""
     places = [i for i, trial_data in enumerate(predictor.data) if not trial_data.pressurised_in_recording]
     if not places:
         return None
     releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
     jobs = predictor.jobs(state.theta, state.trial_effects)[places]
-    sensitivities = _release_sensitivities(predictor, jobs, releases)
-    trial_effects = state.trial_effects.copy()
-    centre, precision = trial_effect_prior(problem, state)
-    any_moved = False
-    for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
+    trial_effects, (centre, precision) = state.trial_effects.copy(), trial_effect_prior(problem, state)
+    for i, candidates_s, sensitivity in zip(
+        places, releases, _release_sensitivities(predictor, jobs, releases), strict=True
+    ):
         noise = state.rho, float(state.variance[i])
         effects, gain = _best_release(
             predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
         )
         if gain > LEAST_DECREASE:
-            trial_effects[i], any_moved = effects, True
-    return replace(state, trial_effects=trial_effects) if any_moved else None
-
-
-def _confirmed(predictor: Predictor, problem: MixedProblem, state: FitState, proposed: FitState) -> FitState:
-    """The state with those proposed effects that remain better after a few steps on simulated trajectories. Trials
-    without a proposal stay as they are.
-    """
-    rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
+            trial_effects[i] = effects
+    rows = np.flatnonzero((trial_effects != state.trial_effects).any(axis=1))
+    if not rows.size:
+        return None
+    proposed = replace(state, trial_effects=trial_effects)
     predictor, problem, (current, proposed) = subset(predictor, problem, rows, state, proposed)
     # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
     for _ in range(3):
@@ -175,7 +164,7 @@ def _confirmed(predictor: Predictor, problem: MixedProblem, state: FitState, pro
     )
     trial_effects = state.trial_effects.copy()
     trial_effects[rows[better]] = proposed.trial_effects[better]
-    return replace(state, trial_effects=trial_effects)
+    return replace(state, trial_effects=trial_effects) if better.any() else None
 
 
 def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
