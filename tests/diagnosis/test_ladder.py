@@ -30,7 +30,8 @@ from vinetrack.diagnosis.locate import drift, locate, per_trial_estimates
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference.fit import fit, predict_prepared, prepared_pairs, refit
+from vinetrack.inference.fit import fit, predict_prepared, refit
+from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import EXPONENT, Number
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
@@ -77,7 +78,7 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs)
     found = vt.fit(model, one_vine)
     for condition in dict.fromkeys(trial.condition for trial, _ in one_vine):
         others = vt.fit(model, [pair for pair in one_vine if pair[0].condition != condition])
-        unseen = prepared_pairs([pair for pair in one_vine if pair[0].condition == condition])
+        unseen, _ = prepare([pair for pair in one_vine if pair[0].condition == condition], weighted=False)
         predicted += predict_prepared(others, unseen, from_rest=True)
     by_hand = Errors(tuple(predicted), {}).rms_m
     assert left_out(found).rms_m == pytest.approx(by_hand, rel=0.003)

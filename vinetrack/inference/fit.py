@@ -29,7 +29,7 @@ from vinetrack.effects import EffectError
 from vinetrack.inference.errors import root_without, student, trial_information
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
-from vinetrack.inference.gaussian_processes import at_correlation, whiten
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import FitState, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import (
     CONVERGED_DECREASE,
@@ -244,30 +244,18 @@ def _with_release_and_origin_fitted(
     holds the columns of release and origin, `fit_correlation` is the noise correlation with which predictions fit them,
     `noise` the variance of a position, m².
     """
-    white = whiten(design, trial_data.first, fit_correlation, trial_data.relative_sd)
-    fixed = np.array([not trial_data.pressurised_in_recording, True])
-    inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
-    points = residual.size
-    whitener = whiten(np.eye(points), trial_data.first, fit_correlation, trial_data.relative_sd)
-    estimator = inverse @ (white.T @ whitener)
-    columns = np.column_stack([loadings, residual])
-    aligned = columns - design @ (estimator @ columns)
-    covariance = noise * _correlation(trial_data, state.rho)
-    propagated = estimator @ covariance
-    explained = 2 * np.einsum("nk,kn->n", design, propagated) - np.einsum(
-        "nk,kl,nl->n", design, propagated @ estimator.T, design
-    )
-    return aligned[:, :-1], np.maximum(np.diag(covariance) - explained, 0.0), aligned[:, -1]
-
-
-def _correlation(trial_data: FitTrial, rho: float) -> Floats:
-    """Noise covariance of a trial's points over its variance, shape (n_points, n_points); stretches are independent."""
-    points = np.arange(trial_data.time_s.size)
-    stretch = np.cumsum(trial_data.first)
-    same_stretch = stretch[:, None] == stretch
-    sd = trial_data.point_sd
-    correlation = np.power(rho, np.arange(points.size))[np.abs(points[:, None] - points)]
-    return np.asarray(np.where(same_stretch, correlation, 0.0) * sd[:, None] * sd)
+    points, rows = np.eye(residual.size), np.arange(residual.size)
+    whitener = whiten(points, trial_data.first, fit_correlation, trial_data.relative_sd)
+    white = whitener @ design
+    fitted = np.array([not trial_data.pressurised_in_recording, True])
+    inverse = np.linalg.pinv(white.T @ white * np.outer(fitted, fitted), rcond=1e-10, hermitian=True)
+    left = points - design @ inverse @ (white.T @ whitener)
+    aligned = left @ np.column_stack([loadings, residual])
+    # Stretches are independent.
+    stretch, sd = np.cumsum(trial_data.first), trial_data.point_sd
+    correlation = np.where(stretch[:, None] == stretch, state.rho ** np.abs(rows[:, None] - rows), 0.0)
+    random = noise * np.sum((left @ (correlation * np.outer(sd, sd))) * left, axis=1)
+    return aligned[:, :-1], random, aligned[:, -1]
 
 
 # ------------------------------------------------------------------------------
@@ -297,8 +285,6 @@ def fit_subset(fit: Fit, keep: Sequence[bool], *, most_iterations: int = MOST_IT
 # ------------------------------------------------------------------------------
 # Predictions of a fitted model for trials outside the fit: only their release and origin are fitted.
 
-FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
-
 
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
     """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
@@ -306,71 +292,55 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
 
 
 def predict_from_rest(model: Model, data: Sequence[FitTrial], host: Model) -> list[TrialFit]:
-    """Predict trials by a model of given sizes as `predict_prepared` does from rest, with errors at a noise of 1 m."""
-    return _predicted(*_aligned(model, data, host, 0.0, from_rest=True), 0.0, 1.0)
-
-
-def _predicted(
-    predictor: Predictor, trial_effects: Floats, square: Floats, rho: float, variance: float
-) -> list[TrialFit]:
-    try:
-        trajectories = predictor.trajectories_at(np.empty(0), trial_effects)
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
-    sigma = np.zeros((len(predictor.data), N_TRIAL_EFFECTS))
-    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
-    return [
-        trial_fit(
-            trial_data, trial_effects[i], sigma[i], path.observed_position_m, path.lead_velocity_m_s, rho, variance
-        )
-        for i, (trial_data, path) in enumerate(zip(predictor.data, trajectories, strict=True))
-    ]
+    """Predict trials by a model of given sizes as `predict_prepared` does from rest, with noise of 1 m."""
+    return _aligned(model, data, host, 0.0, 1.0, from_rest=True)[2]
 
 
 def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], from_rest: bool) -> tuple[Predictor, Floats, list[TrialFit]]:
     """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and the trials as predicted."""
     data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
     rho = 0.0 if from_rest else fit.noise_correlation
-    predictor, trial_effects, square = _aligned(fit.model, data, fit.predictor.host, rho, from_rest=from_rest)
-    return predictor, trial_effects, _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
+    variance = fit.noise_m**2 * (1 - rho**2)
+    return _aligned(fit.model, data, fit.predictor.host, rho, variance, from_rest=from_rest)
 
 
 def _aligned(
-    model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, *, from_rest: bool
-) -> tuple[Predictor, Floats, Floats]:
-    predictor, undeviating = (Predictor(_without_free_parameters(model, data), data, host) for _ in range(2))
+    model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, variance: float, *, from_rest: bool
+) -> tuple[Predictor, Floats, list[TrialFit]]:
+    try:
+        base = np.array([model.parameters_of(trial_data.trial) for trial_data in data])
+    except EffectError as error:
+        raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
+    base = base.reshape(len(data), len(model.parameter_names))
+    layout, none = ParameterMap(model, (), (), np.zeros((len(data), 0), dtype=int), base), np.empty(0)
+    predictor, undeviating = (Predictor(layout, data, host) for _ in range(2))
     undeviating.has_pressure_deviation[:] = undeviating.has_damping_deviation[:] = False
     try:
-        trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
+        trial_effects, _ = align(data, predictor, none, initial_trial_effects(data))
         problem = make_problem(undeviating, trial_effects)
         for i in np.flatnonzero(rest_is_seen(data) & from_rest).tolist():
             trial_effects[i, ORIGIN] = problem.release_origin_mean[i, 1] = data[i].rest_origin_m
             problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
-        state = replace(first_state(data, np.empty(0), trial_effects), rho=rho)
+        state = replace(first_state(data, none, trial_effects), rho=rho)
         # 1e-5, 20: decrease, as a part of the misfit, at which a prediction is aligned, and most steps (chosen)
         least = max(1e-5 * cost(undeviating, problem, state), CONVERGED_DECREASE)
         held = FixedTerms(noise=(rho, state.variance))
         solution = solve(undeviating, problem, state, held, most_iterations=20, least_decrease=least)
+        trial_effects = solution.state.trial_effects
+        trajectories = predictor.trajectories_at(none, trial_effects)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
-    square = at_correlation(solution.cross_products, rho)[:, :2, :2]
-    return predictor, solution.state.trial_effects, square
+    trials = [
+        trial_fit(each, trial_effects[i], moved.observed_position_m, moved.lead_velocity_m_s, rho, variance)
+        for i, (each, moved) in enumerate(zip(data, trajectories, strict=True))
+    ]
+    return predictor, trial_effects, trials
 
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     """Trials with enough frames at rest to determine where they started. Shape (n_trials,)."""
-    return np.array(
-        [trial_data.n_rest >= FEWEST_AT_REST or trial_data.imprecise_rest is not None for trial_data in data],
-        dtype=bool,
-    )
-
-
-def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
-    """Prepare the data of trials for a prediction."""
-    data, unusable = prepare(pairs, weighted=False)
-    for name, reason in unusable.items():
-        raise FitError(f"Trial {name}: {reason}.")
-    return data
+    # 5: frames at rest that determine where a vine started, to half the noise of one (derived)
+    return np.array([each.n_rest >= 5 or each.imprecise_rest is not None for each in data], dtype=bool)
 
 
 def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
@@ -380,15 +350,6 @@ def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
         if number.key == YIELD_PRESSURE and number.vine in (trial.vine, trial.yield_group):
             return replace(trial_data, trial=replace(trial, yield_pressure_Pa=number.value))
     return trial_data
-
-
-def _without_free_parameters(model: Model, data: Sequence[FitTrial]) -> ParameterMap:
-    try:
-        base = np.array([model.parameters_of(trial_data.trial) for trial_data in data])
-    except EffectError as error:
-        raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
-    base = base.reshape(len(data), len(model.parameter_names))
-    return ParameterMap(model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
 @in_one_blas_thread
@@ -422,31 +383,15 @@ def fit(
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
     solution = solve_from_scratch(predictor, fixed_terms, watch)
-    _refuse_a_standstill(predictor, solution)
-    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms})
-    return replace(fitted, pairs=tuple(pairs))
-
-
-def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
-    """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks."""
     trajectories = predictor.trajectories_at(solution.state.theta, solution.state.trial_effects)
     # 1e-9: travel below which a simulated trial counts as standing still (derived)
-    if any(float(np.ptp(trajectory.observed_position_m)) > 1e-9 for trajectory in trajectories):
-        return
-    model = " + ".join(predictor.layout.model.names)
-    trials = [trial_data.trial for trial_data in predictor.data]
-    angle, pressure = (
-        f"{min(values):g}" if min(values) == max(values) else f"{min(values):g} to {max(values):g}"
-        for values in (
-            [round(math.degrees(trial.growth_angle_rad)) for trial in trials],
-            [round(trial.pressure_Pa / 1e3, 1) for trial in trials],
+    if all(float(np.ptp(each.observed_position_m)) <= 1e-9 for each in trajectories):
+        raise FitError(
+            f"The model {' + '.join(model.names)} moves no trial. Check growth_angle_deg (0 is straight down),"
+            " pressure_kPa and yield_pressure_kPa, or add the effect that drives them to `model:`."
         )
-    )
-    raise FitError(
-        f"The model {model} moves no trial: at a growth angle of {angle}° and {pressure} kPa nothing in it drives"
-        " them. Check growth_angle_deg (0 is straight down), pressure_kPa and yield_pressure_kPa, or add the effect"
-        " that drives them to `model:`."
-    )
+    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms})
+    return replace(fitted, pairs=tuple(pairs))
 
 
 def refit(
@@ -592,5 +537,7 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
     ['P48_1', 'P48_2']
     """
-    data = prepared_pairs(pairs)
+    data, unusable = prepare(pairs, weighted=False)
+    for name, reason in unusable.items():
+        raise FitError(f"Trial {name}: {reason}.")
     return with_bands(fitted, data, predict_prepared(fitted, data))

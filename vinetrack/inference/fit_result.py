@@ -6,7 +6,6 @@ import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -132,17 +131,7 @@ class ParameterMap:
 
     def values(self, theta: Floats) -> Floats:
         """Values, SI, of scaled parameters. Shapes: theta (n_free,) → (n_free,)."""
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta * self.scales)
-
-    @cached_property
-    def logarithmic(self) -> NDArray[np.bool_]:
-        """Free parameters that are scaled as logarithms, shape (n_free,)."""
-        return np.array([number.logarithmic for number in self.free], dtype=bool)
-
-    @cached_property
-    def scales(self) -> Floats:
-        """Scales of the free parameters, shape (n_free,)."""
-        return np.array([number.scale for number in self.free])
+        return np.array([number.from_scaled(value) for number, value in zip(self.free, theta.tolist(), strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
         """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (NaN where

@@ -29,7 +29,6 @@ from vinetrack.inference.fit_result import (
     BetweenTrialSpread,
     Fit,
     Number,
-    ParameterMap,
     TrialFit,
 )
 from vinetrack.inference.gaussian_processes import whiten
@@ -253,18 +252,14 @@ def assemble(
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout = predictor.layout
     with_errors = with_systematics(predictor, solution, options.get("held"))
-    extended = with_errors.solution
+    extended, count = with_errors.solution, len(layout.free)
     by_noise = precision(extended)
-    trials = _trial_fits(predictor, solution, by_noise.first(len(layout.free)))
-    trials = _with_errors_removed(trials, with_errors)
-    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources)
-    precision_of_fit = precision_of_fit.first(len(layout.free))
+    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources).first(count)
     numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit)
+    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     chi2 = chi2_per_dof(predictor, solution)
-    weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
-    variance_state = with_errors.solution.state
-    variance = float(np.average(variance_state.variance, weights=weights)) / (1 - variance_state.rho**2)
-    has_deviations = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
+    points, state = solution.problem.points, extended.state
+    variance = float(np.average(state.variance, weights=points)) / (1 - state.rho**2)
     # Yield pressures belong to the trials and stay in the numbers.
     values = [
         (number.key, number.vine, number.value)
@@ -274,17 +269,17 @@ def assemble(
     return Fit(
         model=layout.model.with_values(values_by_key(values)),
         numbers=numbers,
-        covariance=_in_SI_units(layout, numbers, precision_of_fit.covariance),
+        covariance=precision_of_fit.covariance * slopes[:, None] * slopes,
         spreads={
-            name: BetweenTrialSpread(variance_state.spread[k], solution.estimable[k])
+            name: BetweenTrialSpread(state.spread[k], solution.estimable[k])
             for k, name in enumerate(SPREAD_NAMES)
-            if has_deviations[k]
+            if solution.problem.has_deviation[:, k].any()
         },
         noise_m=math.sqrt(variance),
-        noise_correlation=variance_state.rho,
+        noise_correlation=state.rho,
         chi2_per_dof=chi2,
         log_likelihood=solution.log_likelihood() + with_errors.gain,
-        trials=trials,
+        trials=_trial_fits(predictor, solution, with_errors, by_noise.covariance[:count, :count]),
         messages=fit_messages(predictor, solution, numbers, precision_of_fit, chi2),
         left_out=dict(left_out),
         converged=solution.converged,
@@ -292,24 +287,7 @@ def assemble(
         predictor=predictor,
         solution=solution,
         options=options,
-        with_errors=variance_state,
-    )
-
-
-def _with_errors_removed(trials: Sequence[TrialFit], with_errors: WithSystematics) -> tuple[TrialFit, ...]:
-    """Trials with the deviations and residuals of the fit that includes the systematic errors. The deviations come
-    from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit are
-    (LARGEST_DEVIATION). The residuals are those of the step itself.
-    """
-    effects = np.clip(with_errors.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    return tuple(
-        replace(
-            trial,
-            whitened=white,
-            pressure_deviation=float(values[PRESSURE]),
-            damping_deviation=math.expm1(values[DAMPING_DEVIATION]),
-        )
-        for trial, white, values in zip(trials, with_errors.whitened, effects, strict=True)
+        with_errors=state,
     )
 
 
@@ -352,20 +330,14 @@ def _numbers(
     return tuple(numbers)
 
 
-def _in_SI_units(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
-    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
-    return np.asarray(covariance * slopes[:, None] * slopes)
-
-
-def _trial_effect_sigma(solution: Solution, precision_of_fit: Precision) -> Floats:
+def _trial_effect_sigma(solution: Solution, covariance: Floats) -> Floats:
     """Standard errors of the trial effects, including those of the shared parameters, shape (n_trials, 4)."""
     problem, state = solution.problem, solution.state
     white = whitened_products(solution.cross_products, state)
     square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
     inverse = solve_per_trial(square, np.broadcast_to(np.eye(N_TRIAL_EFFECTS), square.shape))
     response = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
-    known = np.where(np.isfinite(precision_of_fit.covariance), precision_of_fit.covariance, 0.0)
-    shared = np.pad(known, (0, 1))
+    shared = np.pad(np.where(np.isfinite(covariance), covariance, 0.0), (0, 1))
     shared_of_trial = shared[problem.index[:, :, None], problem.index[:, None, :]]
     total = inverse + response @ shared_of_trial @ np.swapaxes(response, 1, 2)
     sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
@@ -374,29 +346,37 @@ def _trial_effect_sigma(solution: Solution, precision_of_fit: Precision) -> Floa
     return np.asarray(sigma)
 
 
-def _trial_fits(predictor: Predictor, solution: Solution, precision_of_fit: Precision) -> tuple[TrialFit, ...]:
-    state, sigma = solution.state, _trial_effect_sigma(solution, precision_of_fit)
+def _trial_fits(
+    predictor: Predictor, solution: Solution, with_errors: WithSystematics, covariance: Floats
+) -> tuple[TrialFit, ...]:
+    """The trials at a solution, with the deviations and whitened residuals of the fit that includes the systematic
+    errors: one linear step, unbounded for a poor fit, so that the deviations are limited as those of a fit are.
+    """
+    state, sigma = solution.state, _trial_effect_sigma(solution, covariance)
     trajectories = predictor.trajectories_at(state.theta, state.trial_effects)
-    return tuple(
-        trial_fit(trial_data, state.trial_effects[i], sigma[i], trajectories[i].observed_position_m,
-                  trajectories[i].lead_velocity_m_s, state.rho,
-                  float(state.variance[i]))
-        for i, trial_data in enumerate(predictor.data)
+    deviations = np.clip(with_errors.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    effects = np.column_stack([state.trial_effects[:, :PRESSURE], deviations[:, PRESSURE:N_TRIAL_EFFECTS]])
+    trials = (
+        trial_fit(each, effects[i], moved.observed_position_m, moved.lead_velocity_m_s, state.rho,
+                  float(state.variance[i]), sigma[i])
+        for i, (each, moved) in enumerate(zip(predictor.data, trajectories, strict=True))
     )  # fmt: skip
+    return tuple(replace(trial, whitened=white) for trial, white in zip(trials, with_errors.whitened, strict=True))
 
 
 def trial_fit(
     trial_data: FitTrial,
     trial_effects: Floats,
-    sigma: Floats,
     position_m: Floats,
     velocity_m_s: Floats,
     rho: float,
     variance: float,
+    sigma: Floats | None = None,
 ) -> TrialFit:
     """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
     velocity_m_s (n_points,).
     """
+    sigma = np.full(N_TRIAL_EFFECTS, math.nan) if sigma is None else sigma
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m
     return TrialFit(

@@ -268,7 +268,6 @@ def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
         trial_fit(
             trial_data,
             effects,
-            np.zeros(N_TRIAL_EFFECTS),
             trial_data.lead_position_m - effects[ORIGIN] - columns[:, -1],
             -columns[:, RELEASE],
             state.rho,
