@@ -212,7 +212,7 @@ def differences(fit: Fit) -> list[Difference]:
     """Hypotheses that trials differ, each in its best form, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
         return []
-    base, best = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution, list[Difference]()
+    base, best = with_systematics(fit.predictor, fit.solution).solution, list[Difference]()
     for name, forms_of in BETWEEN.items():
         forms, estimated = forms_of(name, fit, base), list[Difference]()
         for form in forms:

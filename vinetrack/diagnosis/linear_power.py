@@ -155,7 +155,7 @@ def power_of(
 ) -> Power:
     """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
     # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
-    start = None if tests.fit.options["held"].noise is None else noiseless_start(tests.fit)
+    start = noiseless_start(tests.fit) if tests.fit.solution.noise_held else None
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
     normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
     known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests)

@@ -258,7 +258,7 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
     fit adds to σ² for scatter comes on top.
     """
-    extended = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
+    extended = with_systematics(fit.predictor, fit.solution).solution
     plain = np.diag(precision(extended).first(len(fit.numbers)).covariance)
     for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2

@@ -28,7 +28,6 @@ from vinetrack.inference.marginal_likelihood import (
 )
 from vinetrack.inference.optimiser import (
     CONVERGED_VARIANCES,
-    FixedTerms,
     Solution,
     update_variances,
     variance_change,
@@ -108,11 +107,10 @@ class WithSystematics:
     whitened: tuple[Floats, ...]
 
 
-def with_systematics(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> WithSystematics:
+def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematics:
     """Fit the systematic errors along with the parameters of a fit, to first order."""
     errors = systematics_of(predictor, solution)
     extended = errors.beside(solution.columns)
-    held = held or FixedTerms()
     # The column of a parameter without influence is rounding error: with fixed columns, a step along it would be
     # millions of scales long and predict a likelihood that no trajectory confirms.
     fixed_insensitive = replace(solution.problem, free=solution.problem.free & ~precision(solution).insensitive)
@@ -122,12 +120,12 @@ def with_systematics(predictor: Predictor, solution: Solution, held: FixedTerms 
         theta=np.append(solution.state.theta, np.zeros(errors.count)),
         trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
     )
-    state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start, held)
+    state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # errors, so it is subtracted.
-    without_errors = _newton_on_fixed_columns(
-        predictor, solution, solution.columns, fixed_insensitive, solution.state, held
-    )[3]
+    without_errors = _newton_on_fixed_columns(predictor, solution, solution.columns, fixed_insensitive, solution.state)[
+        3
+    ]
     residuals = [values[:, -1] - values[:, :-1] @ change for values, change in zip(extended, moved, strict=True)]
     return WithSystematics(
         solution=replace(
@@ -154,7 +152,6 @@ def _newton_on_fixed_columns(
     columns: Sequence[Floats],
     problem: MixedProblem,
     state: FitState,
-    held: FixedTerms,
 ) -> tuple[FitState, Floats, Floats, float]:
     """Newton steps at fixed sensitivities: state, cross products there, total change of each trial's unknowns, ln L.
     Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
@@ -167,7 +164,8 @@ def _newton_on_fixed_columns(
     total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
 
     def with_variances(products: Floats, state: FitState) -> FitState:
-        return update_variances(predictor, problem, products, state, solution.estimable, held)
+        how = solution.estimable
+        return update_variances(predictor, problem, products, state, how, noise_held=solution.noise_held)
 
     state = with_variances(cross_products, state)
     level = log_likelihood(cross_products, problem, state, solution.estimable)

@@ -15,19 +15,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track
+from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.errors import root_without, student, trial_information
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, pairs_of, prepare
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import FitState, matrix_root, trial_deviation_sd
@@ -63,7 +62,7 @@ from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 from vinetrack.inference.trial_effects import subset
 
 if TYPE_CHECKING:
-    from vinetrack.experiment.folder import Experiment
+    pass
 
 
 # ------------------------------------------------------------------------------
@@ -279,7 +278,7 @@ def fit_subset(fit: Fit, keep: Sequence[bool], *, most_iterations: int = MOST_IT
         solution = solve(predictor, problem, state, held, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": held})
+    return assemble(predictor, solution, fit.left_out, fit.options)
 
 
 # ------------------------------------------------------------------------------
@@ -355,9 +354,8 @@ def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
 @in_one_blas_thread
 def fit(
     model: Model,
-    experiment: Experiment | Path | str | Pairs,
+    pairs: Pairs,
     *,
-    tracks: Mapping[str, Track] | None = None,
     fixed: Iterable[str] = (),
     free: Iterable[str] = (),
     shared: Mapping[str, str] | None = None,
@@ -367,10 +365,9 @@ def fit(
     host: Model | None = None,
     watch: Watch | None = None,
 ) -> Fit:
-    """Fit a model to all trials of an experiment."""
-    pairs, left_out = pairs_of(experiment, tracks)
-    data, unusable = prepare(pairs, weighted=noise is None)
-    left_out = {**left_out, **unusable}
+    """Fit a model to trials and their tracks, see `vinetrack.fit`."""
+    pairs = tuple(pairs)
+    data, left_out = prepare(pairs, weighted=noise is None)
     if not data:
         raise none_to_fit(left_out)
     fixed, free = tuple(fixed), tuple(free)
@@ -390,8 +387,8 @@ def fit(
             f"The model {' + '.join(model.names)} moves no trial. Check growth_angle_deg (0 is straight down),"
             " pressure_kPa and yield_pressure_kPa, or add the effect that drives them to `model:`."
         )
-    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms})
-    return replace(fitted, pairs=tuple(pairs))
+    fitted = assemble(predictor, solution, left_out, options)
+    return replace(fitted, pairs=pairs)
 
 
 def refit(
@@ -494,12 +491,7 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    fitted = assemble(
-        predictor,
-        solution,
-        before.left_out,
-        {**options_used, "shared": shared_used, "held": fixed_terms},
-    )
+    fitted = assemble(predictor, solution, before.left_out, {**options_used, "shared": shared_used})
     return replace(fitted, pairs=before.pairs)
 
 

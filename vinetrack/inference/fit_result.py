@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
-from scipy.special import ndtri
+from scipy.special import ndtri_exp
 
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
@@ -601,7 +601,4 @@ def _deviate(difference: Floats, covariance: Floats) -> float:
         return math.nan
     square = float(difference @ np.linalg.solve(covariance, difference))
     # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
-    log_tail = -square / 2 - math.log(2)
-    if log_tail > -700:
-        return -float(ndtri(math.exp(log_tail)))
-    return math.sqrt(square - math.log(square))
+    return -float(ndtri_exp(-square / 2 - math.log(2)))

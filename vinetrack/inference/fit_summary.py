@@ -64,7 +64,7 @@ def film_influence(fit: Fit) -> Floats:
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
     errors = systematics_of(fit.predictor, fit.solution, ["film"])
-    solution = with_systematics(fit.predictor, fit.solution, fit.options.get("held")).solution
+    solution = with_systematics(fit.predictor, fit.solution).solution
     plain = robust_variances(fit.predictor, solution)[0]
     products = fit.predictor.products(errors.beside(solution.columns))
     both = replace(solution, problem=errors.among(solution.problem), cross_products=products)

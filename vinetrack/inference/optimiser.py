@@ -89,9 +89,13 @@ def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) 
     """
     rho = track_correlation(data)
     variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
-    return FitState(
-        theta, trial_effects, _stated_between_trial_sd(data), rho, np.maximum(variance, variance_floor(data))
-    )
+    relative = [
+        trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
+        for trial_data in data
+        if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
+    ]
+    spread = (float(np.mean(relative)) if relative else TYPICAL_SPREADS[0]), TYPICAL_SPREADS[1]
+    return FitState(theta, trial_effects, spread, rho, np.maximum(variance, variance_floor(data)))
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
@@ -106,16 +110,6 @@ def track_correlation(data: Sequence[FitTrial]) -> float:
 
 
 TYPICAL_SPREADS = (0.01, 0.03)  # Usual standard deviations of pressure (relative) and ln B between trials (chosen)
-
-
-def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
-    """Between-trial standard deviation of pressure as the sheet states it, and the typical one of ln B."""
-    relative = [
-        trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
-        for trial_data in data
-        if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
-    ]
-    return (float(np.mean(relative)) if relative else TYPICAL_SPREADS[0]), TYPICAL_SPREADS[1]
 
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
@@ -204,6 +198,7 @@ class Solution:
     estimable: tuple[bool, bool]
     converged: bool
     iterations: int
+    noise_held: bool = False
 
     def deviance(self, *, restricted: bool = True) -> float:
         """−2 ln of the (restricted) likelihood at the state."""
@@ -243,9 +238,11 @@ def solve(
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
     Levenberg–Marquardt damping where a full step fails.
     """
-    fixed_terms = fixed_terms or FixedTerms()
-    estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
-    state = _with_fixed_terms(state, fixed_terms)
+    fixed_terms, estimable_sd = fixed_terms or FixedTerms(), estimable(problem)
+    if fixed_terms.spread is not None:
+        state, estimable_sd = replace(state, spread=fixed_terms.spread), (False, False)
+    if noise_held := fixed_terms.noise is not None:
+        state = replace(state, rho=fixed_terms.noise[0], variance=fixed_terms.noise[1])
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
     damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
     columns, cross_products = _linearise(predictor, state)
@@ -255,7 +252,8 @@ def solve(
         # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
-        state = update_variances(predictor, problem, cross_products, state, estimable_sd, fixed_terms, far_off=far_off)
+        how = {"noise_held": noise_held, "far_off": far_off}
+        state = update_variances(predictor, problem, cross_products, state, estimable_sd, **how)
         if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
             break  # They have taken up what the model lacks.
         variances_moved = variance_change(before, state)
@@ -292,15 +290,7 @@ def solve(
             break
         state = accepted or state
         decrease = penalised_squares - cost(predictor, problem, state, residuals_in(columns))
-    return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
-
-
-def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:
-    if fixed_terms.spread is not None:
-        state = replace(state, spread=fixed_terms.spread)
-    if fixed_terms.noise is not None:
-        state = replace(state, rho=fixed_terms.noise[0], variance=fixed_terms.noise[1])
-    return state
+    return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration, noise_held)
 
 
 def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
@@ -315,12 +305,12 @@ def update_variances(
     cross_products: Floats,
     state: FitState,
     estimable_sd: tuple[bool, bool],
-    fixed_terms: FixedTerms,
     *,
+    noise_held: bool,
     far_off: bool = False,
 ) -> FitState:
     """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
-    if fixed_terms.noise is None:
+    if not noise_held:
         rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
     if any(estimable_sd) and not far_off:

@@ -251,7 +251,7 @@ def assemble(
 ) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout = predictor.layout
-    with_errors = with_systematics(predictor, solution, options.get("held"))
+    with_errors = with_systematics(predictor, solution)
     extended, count = with_errors.solution, len(layout.free)
     by_noise = precision(extended)
     precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources).first(count)

@@ -124,32 +124,34 @@ def _changes_of(
 
 def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
-    payload_step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
-    heavier = [
-        (i, replace(each, trial=replace(each.trial, payload_kg=(1 + payload_step) * each.trial.payload_kg)))
-        for i, each in enumerate(predictor.data)
-        if each.trial.payload_kg > 0 and each.trial.travel_ratio != 1
-    ]
+    carried = [each.trial.payload_kg > 0 and each.trial.travel_ratio != 1 for each in predictor.data]
+    step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
     # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
     return {
-        i: (round(predictor.data[i].trial.payload_kg, 9), 0.005 / payload_step * change_m)
-        for i, change_m in _changes_of(predictor, solution, heavier)
+        i: (round(predictor.data[i].trial.payload_kg, 9), 0.005 / step * change_m)
+        for i, change_m in _changes_by(predictor, solution, "payload_kg", step, carried)
     }
 
 
 def _film_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Error of the film mass of each vine, `FILM_ERROR`."""
-    heavier = [
-        (
-            i,
-            replace(
-                each, trial=replace(each.trial, film_density_kg_m3=(1 + FILM_ERROR) * each.trial.film_density_kg_m3)
-            ),
-        )
+    heavy = [each.trial.linear_density_kg_m > 0 for each in predictor.data]
+    return {
+        i: (predictor.data[i].trial.vine, change_m)
+        for i, change_m in _changes_by(predictor, solution, "film_density_kg_m3", FILM_ERROR, heavy)
+    }
+
+
+def _changes_by(
+    predictor: Predictor, solution: Solution, name: str, step: float, varied: Sequence[bool]
+) -> Iterator[tuple[int, Floats]]:
+    """`_changes_of` the varied trials where a field of the sheet is larger by a relative step."""
+    larger = [
+        (i, replace(each, trial=replace(each.trial, **{name: (1 + step) * getattr(each.trial, name)})))
         for i, each in enumerate(predictor.data)
-        if each.trial.linear_density_kg_m > 0
+        if varied[i]
     ]
-    return {i: (predictor.data[i].trial.vine, change_m) for i, change_m in _changes_of(predictor, solution, heavier)}
+    return _changes_of(predictor, solution, larger)
 
 
 def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
