@@ -84,7 +84,6 @@ class FitTrial:
     relative_sd: Floats | None = None
     blur_s: float = 0.0
     smoothing: Smoothing | None = None  #: how positions were smoothed of which one in several is kept
-    smoothed_frame_s: float = 0.0  #: spacing of the frames that were smoothed over, s
     sees_end: bool = False  #: whether the last point lies behind the end of growth
 
     @cached_property
@@ -98,7 +97,7 @@ class FitTrial:
         if self.smoothing is None:
             return np.zeros(1), np.ones(1)
         places = np.arange(self.smoothing.window) - self.smoothing.window // 2
-        return np.asarray(places * self.smoothed_frame_s), self.smoothing.weights
+        return np.asarray(places * (self.frame_s / self.smoothing.decimation)), self.smoothing.weights
 
     @property
     def point_sd(self) -> Floats:
@@ -164,11 +163,9 @@ def prepare_trial(
     if rounding_m > 0 and imprecise_rest is None:
         quantised, imprecise_rest = _quantised_points(track, usable, rounding_m)
         usable &= ~quantised
-    smoothed_frame_s = 0.0
     if smoothing is not None:
         # Near both ends the filter has no full window, and programs differ in how they pad it.
         places = np.flatnonzero(usable)[smoothing.window // 2 : -(smoothing.window // 2)]
-        smoothed_frame_s = float(np.median(np.diff(track.time_s[places])))
         usable = np.isin(np.arange(usable.size), places[:: smoothing.decimation])
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
@@ -178,7 +175,10 @@ def prepare_trial(
         raise FitError("its times do not increase: sort the rows or drop repeated ones")
     noise_m, correlation = position_noise(time_s, position_m)
     noise_m = max(noise_m, rounding_m)
-    if track.pressure_Pa is None and _cannot_be_driven(trial):
+    # The pressure must be able to move a bare vine within the errors of the sheet; gravity alone may move a payload.
+    room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
+    bare = track.pressure_Pa is None and trial.travel_ratio != 1 and trial.payload_kg == 0
+    if bare and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa:
         stated, least = (
             pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in (trial.pressure_Pa, trial.yield_pressure_Pa)
         )
@@ -222,7 +222,6 @@ def prepare_trial(
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
-        smoothed_frame_s=smoothed_frame_s,
         sees_end=bool(usable[end].any()),
     )
 
@@ -298,12 +297,6 @@ def _quantised_points(
     standstill_start = int(np.flatnonzero(y != y[-1])[-1]) + 1
     quantised[places[standstill_start + 1 :]] = True
     return quantised, ImpreciseRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
-
-
-def _cannot_be_driven(trial: Trial) -> bool:
-    """Whether the pressure cannot move a bare vine within the errors of the sheet; gravity alone may move a payload."""
-    room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
-    return trial.travel_ratio != 1 and trial.payload_kg == 0 and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa
 
 
 def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], NDArray[np.int_]]:

@@ -441,11 +441,6 @@ class NumberTable(Printed):
             raise FitError(f"{name!r} is {'no number' if not fits else 'more than one number'} of the fit: {known}.")
         return fits[0]
 
-    def correlation(self, first: str, second: str) -> float:
-        """Correlation of the errors of two numbers."""
-        i, j = self.numbers.index(self[first]), self.numbers.index(self[second])
-        return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
-
     def table(self) -> pd.DataFrame:
         """One row per number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`; SI."""
         import pandas as pd
@@ -492,10 +487,6 @@ class Fit(NumberTable, Drawn):
             return state
         return replace(state, spread=with_errors.spread, rho=with_errors.rho, variance=with_errors.variance)
 
-    def trial(self, name: str) -> TrialFit:
-        """The trial of that name; KeyError where there is none."""
-        return {trial.name: trial for trial in self.trials}[name]
-
     @property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the effects of the model, in order."""
@@ -524,7 +515,9 @@ def numbers_text(fit: Any) -> list[str]:
     """The numbers of a fit, its noise and its messages as lines of text."""
     head = ("", "value", "error", "of it shared", "95 % interval", "unit")
     lines = table(map(number_row, fit.numbers), head, indent="  ", align="<><<<<")
-    lines += [_spread_line(name, spread) for name, spread in fit.spreads.items()]
+    for name, spread in fit.spreads.items():
+        how = "" if spread.estimated else " (fixed: given, too few trials to estimate it, or a poor fit)"
+        lines.append(f"between-trial standard deviation of {name} {100 * spread.value:.2g} %{how}")
     lines.append(
         f"noise {fit.noise_m * 1e3:.3g} mm, correlation {fit.noise_correlation:.2f};"
         f" χ² per degree of freedom {fit.chi2_per_dof:.3g}; ln L {fit.log_likelihood:.1f}"
@@ -546,11 +539,6 @@ def number_row(number: Number) -> tuple[str, ...]:
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
     error, shared = (f"± {sigma * factor:.{digits}f}" for sigma in (number.sigma, number.shared_sigma))
     return number.title, value, error, shared if number.shared else "", f"{low} to {high}", unit
-
-
-def _spread_line(name: str, spread: BetweenTrialSpread) -> str:
-    how = "" if spread.estimated else " (fixed: given, too few trials to estimate it, or a poor fit)"
-    return f"between-trial standard deviation of {name} {100 * spread.value:.2g} %{how}"
 
 
 # ------------------------------------------------------------------------------

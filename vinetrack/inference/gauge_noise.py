@@ -21,6 +21,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.units import AMBIENT_PRESSURE_PA
@@ -101,14 +102,17 @@ def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
     """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held. Shapes: traces
     (n,).
     """
-    candidates = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
-    scatter_digits = [digits for _, digits in filter(None, candidates)]
+    found = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
+    scatter_digits = [digits for *_, digits in filter(None, found)]
     # Samples rounded to steps coarser than their noise lie on lines for that reason alone.
     # 2.0: least median scatter, in last digits, of the readings found in traces (measured)
     interpolated = bool(scatter_digits) and float(np.median(scatter_digits)) >= 2.0
     return [
-        candidate[0] if interpolated and candidate is not None else _samples_as_readings(pressure_Pa)
-        for candidate, pressure_Pa in zip(candidates, traces, strict=True)
+        # Readings have the rounding error that follows from their own resolution.
+        Readings(one[0], one[1], _resolution(one[1]) / math.sqrt(12))
+        if interpolated and one is not None
+        else _samples_as_readings(pressure_Pa)
+        for one, pressure_Pa in zip(found, traces, strict=True)
     ]
 
 
@@ -135,8 +139,10 @@ def _samples_as_readings(pressure_Pa: Floats) -> Readings:
     )  # fmt: skip
 
 
-def _interpolated_readings(pressure_Pa: Floats) -> tuple[Readings, float] | None:
-    """Readings of an interpolated or held trace and their scatter in last digits; None if it is neither."""
+def _interpolated_readings(pressure_Pa: Floats) -> tuple[Floats, Floats, float] | None:
+    """Places and values of the readings of an interpolated or held trace and their scatter in last digits; None if it
+    is neither.
+    """
     steps = np.abs(np.diff(pressure_Pa))
     if pressure_Pa.size < 4 or not steps.any():
         return None
@@ -145,18 +151,13 @@ def _interpolated_readings(pressure_Pa: Floats) -> tuple[Readings, float] | None
         np.mean(steps == 0.0) > INTERPOLATED_PART
         and (held_readings := _sample_and_hold_readings(pressure_Pa, digit_Pa)) is not None
     ):
-        return _with_rounding(*held_readings), math.inf
+        return *held_readings, math.inf
     begins = _straight_runs(pressure_Pa, max(0.5 * digit_Pa, EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa)))))
     within = np.diff(begins, append=pressure_Pa.size) - 2
     if begins.size == 1 or np.sum(np.maximum(within, 0)) < INTERPOLATED_PART * pressure_Pa.size:
         return None
     places, values_Pa = _line_intersections(pressure_Pa, begins)
-    return _with_rounding(places, values_Pa), rough_noise(values_Pa) / digit_Pa if digit_Pa > 0 else math.inf
-
-
-def _with_rounding(places: Floats, values_Pa: Floats) -> Readings:
-    """Readings with the rounding error that follows from their own resolution."""
-    return Readings(places, values_Pa, _resolution(values_Pa) / math.sqrt(12))
+    return places, values_Pa, rough_noise(values_Pa) / digit_Pa if digit_Pa > 0 else math.inf
 
 
 def _resolution(pressure_Pa: Floats) -> float:
@@ -332,14 +333,11 @@ def noise_correlations(traces: Sequence[Floats]) -> list[float]:
     if ratio < 3.0 * sigma:
         return [0.0]
     rhos = np.linspace(0.0, 0.97, 98)
-    told = np.log(_third_difference_variance(rhos**COMPARED_LAG) / _third_difference_variance(rhos))
+    # Variances of third differences of such noise, relative to those of white noise
+    far, near = (1 - 1.5 * rho + 0.6 * rho**2 - 0.1 * rho**3 for rho in (rhos**COMPARED_LAG, rhos))
+    told = np.log(far / near)
     nearby = sigma * np.array([0.0, -0.5, 0.5, -1.0, 1.0, -1.5, 1.5, -2.0, 2.0])
     return [*np.interp(ratio + nearby, told, rhos).tolist(), 0.0]
-
-
-def _third_difference_variance(rho: Floats) -> Floats:
-    """Variance of third differences of noise with lag-one correlation `rho`, relative to that of white noise."""
-    return np.asarray(1 - 1.5 * rho + 0.6 * rho**2 - 0.1 * rho**3)
 
 
 def whitened(values: Floats, rho: float) -> Floats:
@@ -586,7 +584,7 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
 
 class Curves:
     """The curves through the readings of traces, given their noise; `log_likelihood` is that of the readings, with the
-    curves integrated out; `excess` is what they leave, in units of what noise may leave.
+    curves integrated out; `excess` is what they leave, in units of what noise may leave (F test).
     """
 
     def __init__(self, traces: Sequence[Recorded], clock: tuple[float, float]) -> None:
@@ -597,7 +595,13 @@ class Curves:
         information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
         explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
         left = squares - np.sum(self.found.mean * explained, axis=1)
-        self.excess = left / [_largest_residual_squares(trace) for trace in traces]
+        degrees = np.array([trace.readings.values_Pa.size - 1 for trace in traces])
+        of_noise = [trace.noise.degrees for trace in traces]
+        # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
+        largest = degrees * fdtri(degrees, of_noise, 1 - 1e-5)
+        # None where the scale of curves ends
+        ends = [np.min(trace.readings.values_Pa) < -0.9 * AMBIENT_PRESSURE_PA for trace in traces]
+        self.excess = left / np.where(ends, 1e-300, largest)
         scales = np.array([math.log(trace.noise.sigma_Pa) * trace.readings.places.size for trace in traces])
         correlated = 0.5 * np.log1p([-(trace.noise.rho**2) for trace in traces])
         without = correlated - scales - np.log(np.abs(self.factors[:, 0, 0])) - 0.5 * squares
@@ -652,16 +656,3 @@ def _principal_errors(errors_Pa: Floats, least_Pa: float) -> Floats:
     # 1e-2: part of the total error variance of a curve below which a principal direction is dropped (chosen)
     kept = sizes_Pa**2 > max(1e-2 * float(np.sum(sizes_Pa**2)), least_Pa**2 * len(errors_Pa))
     return np.asarray((directions * sizes_Pa)[:, kept])
-
-
-def _largest_residual_squares(trace: Recorded) -> float:
-    """Largest residual sum of squares, in units of the noise, of a curve that explains a trace (F test); none where the
-    scale of curves ends.
-    """
-    from scipy.special import fdtri
-
-    degrees = trace.readings.values_Pa.size - 1
-    if np.min(trace.readings.values_Pa) < -0.9 * AMBIENT_PRESSURE_PA:
-        return 1e-300
-    # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
-    return float(degrees * fdtri(degrees, trace.noise.degrees, 1 - 1e-5))

@@ -22,7 +22,6 @@ from vinetrack.inference.marginal_likelihood import (
     LARGEST_SPREAD,
     FitState,
     MixedProblem,
-    deviances,
     estimate_between_trial_sd,
     estimate_noise,
     levenberg_marquardt_step,
@@ -199,11 +198,6 @@ class Solution:
     converged: bool
     iterations: int
     noise_held: bool = False
-
-    def deviance(self, *, restricted: bool = True) -> float:
-        """−2 ln of the (restricted) likelihood at the state."""
-        part = marginal(self.cross_products, self.problem, self.state)
-        return float(deviances(part, self.problem, self.state, np.array([self.state.spread]), restricted=restricted)[0])
 
     def log_likelihood(self) -> float:
         """`marginal_likelihood.log_likelihood` at the state."""

@@ -411,7 +411,11 @@ def _with_best_damping(
     the drive at the observed speed.
     """
     exponents = layout.rows(theta)[0][:, layout.model.parameter_names.index(EXPONENT)]
-    log_B = np.log(list(map(_driving_force_N, data))) - exponents * np.log(list(map(middle_speed, data)))
+    # Forces on the tips above the yield forces, N, from the recorded pressures where there are any
+    pressure_Pa = np.array([each.typical_pressure_Pa for each in data])
+    over_Pa = pressure_Pa - np.nan_to_num([each.trial.yield_pressure_Pa for each in data])
+    force_N = np.maximum(over_Pa, 1e-3 * np.abs(pressure_Pa)) * [each.trial.area_m2 for each in data]
+    log_B = np.log(np.maximum(force_N, 1e-9)) - exponents * np.log(list(map(middle_speed, data)))
     of_trial, theta = layout.index[:, layout.keys.index(DAMPING)], theta.copy()
     best = dict.fromkeys(np.unique(of_trial), (math.inf, 0.0))
     for part in (0.2, 0.4, 0.6, 0.8, 0.95, 1.1):  # (chosen)
@@ -434,14 +438,6 @@ def middle_speed(trial_data: FitTrial) -> float:
     high = max(high, low + 1) if low + 1 < y.size else low
     elapsed = trial_data.time_s[high] - trial_data.time_s[low] or trial_data.frame_s
     return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
-
-
-def _driving_force_N(trial_data: FitTrial) -> float:
-    """Force on the tip above the yield force, N, from the recorded pressure where there is one."""
-    trial = trial_data.trial
-    pressure_Pa = trial_data.typical_pressure_Pa
-    over_Pa = pressure_Pa - np.nan_to_num(trial.yield_pressure_Pa)
-    return max(float(over_Pa) * trial.area_m2, 1e-3 * abs(pressure_Pa) * trial.area_m2, 1e-9)
 
 
 def align(
