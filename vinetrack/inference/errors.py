@@ -9,20 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.experiment.schema import GROUPINGS
-from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
     at_unknowns,
     inverse_of_block,
     levenberg_marquardt_step,
-    log_likelihood,
     matrix_root,
     trial_effects_eliminated,
 )
@@ -94,8 +93,7 @@ def student(dof: Floats) -> Floats:
     return np.asarray(stdtrit(np.minimum(dof, 1e6), 0.975))
 
 
-@dataclass(frozen=True)
-class WithSystematics:
+class WithSystematics(NamedTuple):
     """A fit with its systematic errors included. `solution` holds the free parameters of the fit and after them the
     sizes of the errors in prior standard deviations, and `sources` where each of these comes from. `gain` of ln L is
     that over the fit as it is.
@@ -104,13 +102,11 @@ class WithSystematics:
     solution: Solution
     sources: Sequence[str]
     gain: float
-    whitened: tuple[Floats, ...]
 
 
 def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematics:
     """Fit the systematic errors along with the parameters of a fit, to first order."""
     errors = systematics_of(predictor, solution)
-    extended = errors.beside(solution.columns)
     # The column of a parameter without influence is rounding error: with fixed columns, a step along it would be
     # millions of scales long and predict a likelihood that no trajectory confirms.
     fixed_insensitive = replace(solution.problem, free=solution.problem.free & ~precision(solution).insensitive)
@@ -120,77 +116,50 @@ def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematic
         theta=np.append(solution.state.theta, np.zeros(errors.count)),
         trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
     )
-    state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start)
+    columns = tuple(errors.beside(solution.columns))
+    extended = replace(solution, state=start, problem=problem, columns=columns)
+    reached, level = _newton_on_fixed_columns(predictor, extended)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # errors, so it is subtracted.
-    without_errors = _newton_on_fixed_columns(predictor, solution, solution.columns, fixed_insensitive, solution.state)[
-        3
-    ]
-    residuals = [values[:, -1] - values[:, :-1] @ change for values, change in zip(extended, moved, strict=True)]
-    return WithSystematics(
-        solution=replace(
-            solution,
-            state=state,
-            problem=errors.among(solution.problem),
-            cross_products=cross_products,
-            columns=tuple(
-                np.column_stack([block[:, :-1], left]) for block, left in zip(extended, residuals, strict=True)
-            ),
-        ),
-        sources=errors.sources,
-        gain=level - without_errors,
-        whitened=tuple(
-            whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
-            for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
-        ),
-    )
+    gain = level - _newton_on_fixed_columns(predictor, replace(solution, problem=fixed_insensitive))[1]
+    return WithSystematics(replace(reached, problem=errors.among(solution.problem)), errors.sources, gain)
 
 
-def _newton_on_fixed_columns(
-    predictor: Predictor,
-    solution: Solution,
-    columns: Sequence[Floats],
-    problem: MixedProblem,
-    state: FitState,
-) -> tuple[FitState, Floats, Floats, float]:
-    """Newton steps at fixed sensitivities: state, cross products there, total change of each trial's unknowns, ln L.
-    Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
-    along the direction in which they cancel; no trajectory is simulated here that would reject it.
+def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[Solution, float]:
+    """The solution after Newton steps at fixed sensitivities, and ln L there. Steps are taken as long as they raise
+    ln L. Two parameters that only rounding separates may get a step of any length along the direction in which they
+    cancel; no trajectory is simulated here that would reject it.
     """
+
+    def found(columns: Sequence[Floats], state: FitState) -> tuple[Solution, float]:
+        products = predictor.products(columns)
+        how = solution.estimable
+        after = update_variances(predictor, problem, products, state, how, noise_held=solution.noise_held)
+        now = replace(solution, state=after, cross_products=products, columns=tuple(columns))
+        return now, now.log_likelihood()
+
     # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
     # comparison, where differences count from 1; and the maximum number of steps (measured)
-    converged_decrease_smooth, most_steps = 1e-2, 15
-    cross_products = predictor.products(columns)
-    total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
-
-    def with_variances(products: Floats, state: FitState) -> FitState:
-        how = solution.estimable
-        return update_variances(predictor, problem, products, state, how, noise_held=solution.noise_held)
-
-    state = with_variances(cross_products, state)
-    level = log_likelihood(cross_products, problem, state, solution.estimable)
+    converged_decrease_smooth, most_steps, problem = 1e-2, 15, solution.problem
+    solution, level = found(solution.columns, solution.state)
     for _ in range(most_steps):
-        step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
-        change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
-        products = _products_after_step(cross_products, change)
+        state = solution.state
+        step, own_step, predicted_decrease = levenberg_marquardt_step(solution.cross_products, problem, state, 0.0)
+        changes = np.column_stack([own_step, np.append(step, 0.0)[problem.index], -np.ones(len(own_step))])
+        columns = [
+            np.column_stack([of[:, :-1], -of @ change]) for of, change in zip(solution.columns, changes, strict=True)
+        ]
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after = with_variances(products, before)
-        new_level = log_likelihood(products, problem, after, solution.estimable)
+        after, new_level = found(columns, before)
         if not new_level >= level - converged_decrease_smooth:  # nor is NaN taken
             break
-        cross_products, total_change, state, level = products, total_change + change, after, new_level
-        if predicted_decrease < converged_decrease_smooth and variance_change(before, state) < CONVERGED_VARIANCES:
+        solution, level = after, new_level
+        if (
+            predicted_decrease < converged_decrease_smooth
+            and variance_change(before, after.state) < CONVERGED_VARIANCES
+        ):
             break
-    return state, cross_products, total_change, level
-
-
-def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
-    """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1). The residual
-    becomes r − C·change, the other columns stay.
-    """
-    transformation = np.tile(np.eye(cross_products.shape[-1]), (len(cross_products), 1, 1))
-    transformation[:, :-1, -1] = -change
-    return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
+    return solution, level
 
 
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:

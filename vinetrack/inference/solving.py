@@ -352,16 +352,17 @@ def _trial_fits(
     """The trials at a solution, with the deviations and whitened residuals of the fit that includes the systematic
     errors: one linear step, unbounded for a poor fit, so that the deviations are limited as those of a fit are.
     """
-    state, sigma = solution.state, _trial_effect_sigma(solution, covariance)
+    state, sigma, reached = solution.state, _trial_effect_sigma(solution, covariance), with_errors.solution
     trajectories = predictor.trajectories_at(state.theta, state.trial_effects)
-    deviations = np.clip(with_errors.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    deviations = np.clip(reached.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     effects = np.column_stack([state.trial_effects[:, :PRESSURE], deviations[:, PRESSURE:N_TRIAL_EFFECTS]])
-    trials = (
-        trial_fit(each, effects[i], moved.observed_position_m, moved.lead_velocity_m_s, state.rho,
-                  float(state.variance[i]), sigma[i])
-        for i, (each, moved) in enumerate(zip(predictor.data, trajectories, strict=True))
-    )  # fmt: skip
-    return tuple(replace(trial, whitened=white) for trial, white in zip(trials, with_errors.whitened, strict=True))
+    trials = []
+    for i, (one, moved) in enumerate(zip(predictor.data, trajectories, strict=True)):
+        white = whiten(reached.columns[i][:, -1], one.first, reached.state.rho, one.relative_sd)
+        position_m, velocity_m_s, variance = moved.observed_position_m, moved.lead_velocity_m_s, state.variance[i]
+        trial = trial_fit(one, effects[i], position_m, velocity_m_s, state.rho, float(variance), sigma[i])
+        trials.append(replace(trial, whitened=white / math.sqrt(reached.state.variance[i])))
+    return tuple(trials)
 
 
 def trial_fit(
