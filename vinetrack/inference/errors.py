@@ -132,9 +132,8 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
     """
 
     def found(columns: Sequence[Floats], state: FitState) -> tuple[Solution, float]:
-        products = predictor.products(columns)
-        how = solution.estimable
-        after = update_variances(predictor, problem, products, state, how, noise_held=solution.noise_held)
+        products, estimated = predictor.products(columns), (solution.estimable, solution.noise_held)
+        after = update_variances(predictor, problem, products, state, *estimated)
         now = replace(solution, state=after, cross_products=products, columns=tuple(columns))
         return now, now.log_likelihood()
 

@@ -147,19 +147,12 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
     """The summary of a fit."""
     keys = [entry.name for entry in fields(TrialEstimates)]
     moved = film_influence(fit)
+    same = "numbers covariance spreads noise_m noise_correlation chi2_per_dof log_likelihood converged left_out"
     return FitSummary(
+        **{name: getattr(fit, name) for name in same.split()},
         names=tuple(fit.model.names),
-        numbers=fit.numbers,
-        covariance=fit.covariance,
         moved_by_film=moved,
-        spreads=fit.spreads,
-        noise_m=fit.noise_m,
-        noise_correlation=fit.noise_correlation,
-        chi2_per_dof=fit.chi2_per_dof,
-        log_likelihood=fit.log_likelihood,
-        converged=fit.converged,
         messages=tuple(map(str, (*fit.messages, *film_messages(fit.numbers, moved), *further_messages))),
         warnings=tuple(warnings),
-        left_out=fit.left_out,
         trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
     )

@@ -246,8 +246,7 @@ def solve(
         # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
-        how = {"noise_held": noise_held, "far_off": far_off}
-        state = update_variances(predictor, problem, cross_products, state, estimable_sd, **how)
+        state = update_variances(predictor, problem, cross_products, state, estimable_sd, noise_held, far_off)
         if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
             break  # They have taken up what the model lacks.
         variances_moved = variance_change(before, state)
@@ -299,7 +298,6 @@ def update_variances(
     cross_products: Floats,
     state: FitState,
     estimable_sd: tuple[bool, bool],
-    *,
     noise_held: bool,
     far_off: bool = False,
 ) -> FitState:
