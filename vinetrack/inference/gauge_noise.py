@@ -78,24 +78,14 @@ class GaugeNoise:
 @dataclass(frozen=True)
 class Readings:
     """Readings of a gauge during a trace, Pa, and their places, in samples from the first; both of shape (n,).
-    `rounding_Pa` is the standard deviation of the rounding error, 0 where nothing is rounded. Where the readings are
-    `all_noise`, their scatter does not determine the noise.
+    `rounding_Pa` is the standard deviation of the rounding error, 0 where nothing is rounded. With `edges` they are
+    means of the samples between these, and rounding is all their noise.
     """
 
     places: Floats
     values_Pa: Floats
     rounding_Pa: float = 0.0
-    all_noise: bool = False
     edges: NDArray[np.intp] | None = None
-
-    def means_of(self, curves: Floats) -> Floats:
-        """Block means of curves given at all samples, where the readings are such means. Shapes: curves (n_samples, …)
-        → (n, …).
-        """
-        assert self.edges is not None
-        sums = np.add.reduceat(curves, self.edges[:-1], axis=0)
-        counts = np.diff(self.edges).reshape(-1, *(1,) * (curves.ndim - 1))
-        return np.asarray(sums / counts)
 
 
 def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
@@ -132,11 +122,8 @@ def _samples_as_readings(pressure_Pa: Floats) -> Readings:
     if blocks * FEWEST_BLOCKS > count:
         return plain
     edges = np.round(np.linspace(0, count, blocks + 1)).astype(int)
-    means = [float(np.mean(pressure_Pa[begin:end])) for begin, end in itertools.pairwise(edges)]
-    return Readings(
-        0.5 * (edges[:-1] + edges[1:] - 1), np.array(means), rounding_Pa * math.sqrt(blocks / steps), all_noise=True,
-        edges=edges,
-    )  # fmt: skip
+    means_Pa, middles = np.add.reduceat(pressure_Pa, edges[:-1]) / np.diff(edges), 0.5 * (edges[:-1] + edges[1:] - 1)
+    return Readings(middles, means_Pa, rounding_Pa * math.sqrt(blocks / steps), edges)
 
 
 def _interpolated_readings(pressure_Pa: Floats) -> tuple[Floats, Floats, float] | None:
@@ -287,13 +274,13 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
     """Noise of every trace, shrunk towards that of other traces of the gauge; 0 if negligible or undetermined."""
     own_sigma = [math.nan] * len(readings)
     for i, each in enumerate(readings):
-        if each.values_Pa.size >= FEWEST_SAMPLES and not each.all_noise:
+        if each.values_Pa.size >= FEWEST_SAMPLES and each.edges is None:
             own_sigma[i] = white_noise_sd(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
     known_sigmas = [sigma for sigma in own_sigma if sigma > 0]
     typical = float(np.median(known_sigmas)) if len(known_sigmas) > 1 else 0.0
     noises = []
     for sigma, each in zip(own_sigma, readings, strict=True):
-        if each.all_noise:
+        if each.edges is not None:
             # 1e6: degrees of freedom of a noise that is derived instead of estimated
             noises.append(GaugeNoise(each.rounding_Pa, 1e6, 0.0))
             continue
@@ -457,8 +444,8 @@ class Recorded:
 
     def at_readings(self, clock_s: float) -> Floats:
         """The same at the readings, shape (n_readings, n_splines)."""
-        if self.readings.edges is not None:
-            return self.readings.means_of(self.at_samples(clock_s))
+        if (edges := self.readings.edges) is not None:
+            return np.asarray(np.add.reduceat(self.at_samples(clock_s), edges[:-1]) / np.diff(edges)[:, None])
         return self._splines(self.readings.places, clock_s)
 
     def _splines(self, where: Floats, clock_s: float) -> Floats:
@@ -558,7 +545,7 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
             growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
     raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
     read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
-    correlations = noise_correlations([readings.values_Pa for readings in read if not readings.all_noise])
+    correlations = noise_correlations([readings.values_Pa for readings in read if readings.edges is None])
     noises = [noise_of_traces(read, rho) for rho in correlations]
     noisy = [k for k, of_trace in enumerate(zip(*noises, strict=True)) if min(each.sigma_Pa for each in of_trace) > 0]
     if not noisy:
