@@ -19,11 +19,14 @@ from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
+    at_prior_means,
     at_unknowns,
+    eliminated,
     inverse_of_block,
     levenberg_marquardt_step,
     matrix_root,
-    trial_effects_eliminated,
+    trial_effect_prior,
+    whitened_products,
 )
 from vinetrack.inference.optimiser import (
     CONVERGED_VARIANCES,
@@ -166,8 +169,9 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     information, scores. Shape (n_trials, n_free, n_free).
     """
     problem = solution.problem
-    size, p = problem.prior_mean.size, problem.index.shape[1]
-    blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
+    size, state = problem.prior_mean.size, solution.state
+    white = at_prior_means(whitened_products(solution.cross_products, state), problem, state, -1)
+    blocks, _ = eliminated(white, trial_effect_prior(problem, state)[1])
     placed = at_unknowns(blocks, np.pad(problem.index, ((0, 0), (0, 1)), constant_values=size), size + 1)
     return placed[:, :-1, :-1], placed[:, :-1, -1]
 

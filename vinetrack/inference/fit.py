@@ -49,12 +49,12 @@ from vinetrack.inference.sensitivity import (
     PRESSURE,
     Predictor,
     align,
+    best_start,
     initial_trial_effects,
 )
 from vinetrack.inference.solving import (
     assemble,
     solve_from,
-    solve_from_scratch,
     solve_onward,
     trial_fit,
 )
@@ -315,7 +315,7 @@ def _aligned(
     predictor, undeviating = (Predictor(layout, data, host) for _ in range(2))
     undeviating.has_pressure_deviation[:] = undeviating.has_damping_deviation[:] = False
     try:
-        trial_effects, _ = align(data, predictor, none, initial_trial_effects(data))
+        trial_effects, _ = align(predictor, none, initial_trial_effects(data))
         problem = make_problem(undeviating, trial_effects)
         for i in np.flatnonzero(rest_is_seen(data) & from_rest).tolist():
             trial_effects[i, ORIGIN] = problem.release_origin_mean[i, 1] = data[i].rest_origin_m
@@ -379,7 +379,10 @@ def fit(
         fixed_terms = FixedTerms(spreads, (rho, np.full(len(data), noise_m**2 * (1 - rho**2))))
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
-    solution = solve_from_scratch(predictor, fixed_terms, watch)
+    try:
+        solution = solve_from(predictor, best_start(predictor), fixed_terms, watch=watch)
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated from its starting values: {error}") from error
     trajectories = predictor.trajectories_at(solution.state.theta, solution.state.trial_effects)
     # 1e-9: travel below which a simulated trial counts as standing still (derived)
     if all(float(np.ptp(each.observed_position_m)) <= 1e-9 for each in trajectories):

@@ -304,14 +304,6 @@ def whitened_products(cross_products: Floats, state: FitState) -> Floats:
     return np.asarray(at_correlation(cross_products, state.rho) / state.variance[:, None, None])
 
 
-def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
-    """Whitened cross products of keys, residual and further columns with the trial effects integrated out. Shapes:
-    cross_products (n_trials, 3, k, k) → (n_trials, k − n_effects, k − n_effects).
-    """
-    white = at_prior_means(whitened_products(cross_products, state), problem, state, problem.n_effects + n_keys)
-    return eliminated(white, trial_effect_prior(problem, state)[1])[0]
-
-
 def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
     """Cross products, changed in place: the residual is taken at zero deviations of pressure and ln B, and errors of
     single trials, instead of the current ones, and the priors of release and origin add their pull, and their penalty

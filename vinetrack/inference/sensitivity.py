@@ -26,7 +26,6 @@ from vinetrack.dynamics.simulate import (
     Trajectory,
     bends_of,
     check_completed,
-    simulate_many,
     trajectories,
 )
 from vinetrack.effects import TrialInputs
@@ -385,31 +384,31 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     return trial_effects
 
 
-def candidates(layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor) -> list[Floats]:
-    """Starting values of the scaled parameters, those of least misfit first, for each combination of further starting
-    values. The release of each trial is scanned at the same time.
+def best_start(predictor: Predictor) -> Floats:
+    """Starting values of the scaled parameters of least misfit, of all combinations of further starting values. The
+    release of each trial is scanned at the same time.
     """
-    trial_effects = initial_trial_effects(data)
-    start_values = [
-        sorted({number.start, *number.further_starts}) if number.further_starts else [number.start]
-        for number in layout.free
-    ]
-    scored = []
+    layout, scored = predictor.layout, list[tuple[float, int, Floats]]()
+    trial_effects, failure = initial_trial_effects(predictor.data), None
+    start_values = [sorted({number.start, *number.further_starts}) for number in layout.free]
     for values in itertools.islice(itertools.product(*start_values), 12):
         start = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
-        with suppress(SimulationError):
+        try:
             if DAMPING in layout.keys:
-                start = _with_best_damping(layout, data, predictor, start, trial_effects)
-            scored.append((float(np.sum(align(data, predictor, start, trial_effects)[1])), start))
-    return [start for _, start in sorted(scored, key=lambda scored_start: scored_start[0])]
+                start = _with_best_damping(predictor, start, trial_effects)
+            scored.append((float(np.sum(align(predictor, start, trial_effects)[1])), len(scored), start))
+        except SimulationError as error:
+            failure = error
+    if not scored and failure:
+        raise failure
+    return min(scored)[2]
 
 
-def _with_best_damping(
-    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
-) -> Floats:
+def _with_best_damping(predictor: Predictor, theta: Floats, trial_effects: Floats) -> Floats:
     """Starting values with the B of every vine that has the least misfit of its trials, of a few that balance part of
     the drive at the observed speed.
     """
+    layout, data = predictor.layout, predictor.data
     exponents = layout.rows(theta)[0][:, layout.model.parameter_names.index(EXPONENT)]
     # Forces on the tips above the yield forces, N, from the recorded pressures where there are any
     pressure_Pa = np.array([each.typical_pressure_Pa for each in data])
@@ -424,7 +423,7 @@ def _with_best_damping(
             B = part * float(np.exp(np.mean(log_B[of_trial == k])))
             theta[k] = free.to_scaled(float(np.clip(B, free.lower, free.upper)))
         with suppress(SimulationError):
-            misfit = align(data, predictor, theta, trial_effects)[1]
+            misfit = align(predictor, theta, trial_effects)[1]
             best = {k: min(of, (float(np.sum(misfit[of_trial == k])), float(theta[k]))) for k, of in best.items()}
     theta[list(best)] = [B for _, B in best.values()]
     return theta
@@ -440,32 +439,21 @@ def middle_speed(trial_data: FitTrial) -> float:
     return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
 
 
-def align(
-    data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
-) -> tuple[Floats, Floats]:
+def align(predictor: Predictor, theta: Floats, trial_effects: Floats) -> tuple[Floats, Floats]:
     """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
-    One trajectory per trial is simulated and shifted in time by interpolation. Returns
-    trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,); trial_effects
-    (n_trials, 4) → (n_trials, 4).
+    One trajectory per trial is simulated and shifted in time by interpolation. Returns trial_effects, misfit (ln of the
+    root mean square relative to the travel). Shapes: theta (n_free,); trial_effects (n_trials, 4) → (n_trials, 4).
     """
-    jobs = predictor.jobs(theta, trial_effects)
+    data = predictor.data
+    # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
+    of_sheet = {"pressure_deviation": np.zeros(len(data)), "yield_pressure_Pa": np.full(len(data), math.nan)}
+    jobs = replace(predictor.jobs(theta, trial_effects), **of_sheet)
     durations = [
         trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
-        for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
+        for trial_data, begin in zip(data, jobs.release_s, strict=True)
     ]
     grids = [np.linspace(0.0, duration, 240) for duration in durations]
-    # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
-    trajectories = simulate_many(
-        predictor.layout.model,
-        [trial_data.trial for trial_data in data],
-        grids,
-        traces=[
-            None if trial_data.trace is None else (trial_data.trace[0] - release_s, trial_data.trace[1])
-            for trial_data, release_s in zip(data, jobs.release_s, strict=True)
-        ],
-        parameters=jobs.row,
-        host=predictor.host,
-    )
+    trajectories = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
     best, misfit = trial_effects.copy(), np.zeros(len(data))
     for i, trial_data in enumerate(data):
         begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)

@@ -23,7 +23,7 @@ from vinetrack.inference.errors import (
     widened_covariance,
     with_systematics,
 )
-from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import (
     YIELD_PRESSURE,
     BetweenTrialSpread,
@@ -43,7 +43,6 @@ from vinetrack.inference.marginal_likelihood import (
 from vinetrack.inference.optimiser import (
     FixedTerms,
     Solution,
-    Watch,
     chi2_per_dof,
     cost,
     first_state,
@@ -59,25 +58,12 @@ from vinetrack.inference.sensitivity import (
     RELEASE,
     Predictor,
     align,
-    candidates,
     initial_trial_effects,
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, subset
 
 ALIKE = (5e-4, 1e-3)  # Between-trial standard deviations of pressure and ln B of trials that are alike (chosen)
 STEPS_TO_TELL = 4  # Steps by which it shows whether a fit stays poor (chosen)
-
-
-def solve_from_scratch(predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None) -> Solution:
-    """Solve from the starting values of least misfit from which the model can be simulated."""
-    reason = "no trajectory could be simulated"
-    # 3: maximum number of starting values (chosen)
-    for theta in candidates(predictor.layout, predictor.data, predictor)[:3]:
-        try:
-            return solve_from(predictor, theta, fixed_terms, watch=watch)
-        except SimulationError as error:
-            reason = str(error)
-    raise FitError(f"The model cannot be simulated from any starting values: {reason}")
 
 
 def solve_from(
@@ -89,7 +75,7 @@ def solve_from(
     """Solve from given parameters and the releases that suit them, with the initial noise and standard deviations of
     `first_state`; `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
     """
-    trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
+    trial_effects, _ = align(predictor, theta, initial_trial_effects(predictor.data))
     problem, state = make_problem(predictor, trial_effects), first_state(predictor.data, theta, trial_effects)
     if (rows := _part(predictor)).size:
         state, poor = _solved_for_part(predictor, problem, state, fixed_terms, rows, **how)
@@ -120,7 +106,7 @@ def _solved_for_part(
     solution = _solve_or_alike(part, problem, start, fixed_terms, **how)
     theta, reached = state.theta.copy(), solution.state
     theta[np.unique(predictor.layout.index[rows][predictor.layout.index[rows] >= 0])] = reached.theta
-    effects, _ = align(predictor.data, predictor, theta, state.trial_effects)
+    effects, _ = align(predictor, theta, state.trial_effects)
     effects[rows] = reached.trial_effects
     reached = FitState(theta, effects, reached.spread, reached.rho, state.variance)
     return reached, is_poor_fit(part, solution)
