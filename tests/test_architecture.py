@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 29),
-    "inference": (5229, 14, 49),
+    "inference": (5190, 14, 49),
     "interface": (567, 2, 2),
     "kinematics": (1618, 6, 12),
     "laboratory": (1600, 6, 9),

@@ -134,7 +134,7 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
     cancel; no trajectory is simulated here that would reject it.
     """
 
-    def found(columns: Sequence[Floats], state: FitState) -> tuple[Solution, float]:
+    def estimated_at(columns: Sequence[Floats], state: FitState) -> tuple[Solution, float]:
         products, estimated = predictor.products(columns), (solution.estimable, solution.noise_held)
         after = update_variances(predictor, problem, products, state, *estimated)
         now = replace(solution, state=after, cross_products=products, columns=tuple(columns))
@@ -143,16 +143,17 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
     # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
     # comparison, where differences count from 1; and the maximum number of steps (measured)
     converged_decrease_smooth, most_steps, problem = 1e-2, 15, solution.problem
-    solution, level = found(solution.columns, solution.state)
+    solution, level = estimated_at(solution.columns, solution.state)
     for _ in range(most_steps):
         state = solution.state
         step, own_step, predicted_decrease = levenberg_marquardt_step(solution.cross_products, problem, state, 0.0)
+        # The columns C and r of a trial become C and r − CΔ.
         changes = np.column_stack([own_step, np.append(step, 0.0)[problem.index], -np.ones(len(own_step))])
         columns = [
             np.column_stack([of[:, :-1], -of @ change]) for of, change in zip(solution.columns, changes, strict=True)
         ]
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after, new_level = found(columns, before)
+        after, new_level = estimated_at(columns, before)
         if not new_level >= level - converged_decrease_smooth:  # nor is NaN taken
             break
         solution, level = after, new_level
