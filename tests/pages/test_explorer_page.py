@@ -129,7 +129,7 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser):
     table = compare(browser.page.last.fit, browser.page.campaign.pairs).table.set_index("condition")
     expected_mm = 1e3 * table.loc[list(bars["condition"]), "rms_position_m"].to_numpy(float)
     assert list(bars["now"]) == pytest.approx(expected_mm, rel=1e-9)
-    assert f"off by {np.sqrt(np.mean(expected_mm**2)):.3g} mm" in browser.text("headline")
+    assert f"off by {np.sqrt(np.mean(expected_mm**2)):#.3g} mm" in browser.text("headline")
     found = browser.text("found_reservoir_depletion.gamma")
     gamma, *sigma = re.findall(r"[\d.]+", found)[:2]
     # 1.4 is what the trials were grown with, and the largest that a gas can have.
