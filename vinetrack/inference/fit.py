@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +60,6 @@ from vinetrack.inference.solving import (
 )
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 from vinetrack.inference.trial_effects import subset
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------
 # The 95 % prediction band of a trial that was not in the fit, for its position at each time.
