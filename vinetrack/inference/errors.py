@@ -134,35 +134,36 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
     cancel; no trajectory is simulated here that would reject it.
     """
 
-    def estimated_at(columns: Sequence[Floats], state: FitState) -> tuple[Solution, float]:
-        products, estimated = predictor.products(columns), (solution.estimable, solution.noise_held)
-        after = update_variances(predictor, problem, products, state, *estimated)
-        now = replace(solution, state=after, cross_products=products, columns=tuple(columns))
+    def estimated_at(products: Floats, state: FitState) -> tuple[Solution, float]:
+        after = update_variances(predictor, problem, products, state, solution.estimable, solution.noise_held)
+        now = replace(solution, state=after, cross_products=products)
         return now, now.log_likelihood()
 
     # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
     # comparison, where differences count from 1; and the maximum number of steps (measured)
     converged_decrease_smooth, most_steps, problem = 1e-2, 15, solution.problem
-    solution, level = estimated_at(solution.columns, solution.state)
+    solution, level = estimated_at(predictor.products(solution.columns), solution.state)
+    # The columns C and r of a trial become C and r − CΔ, and so do their products.
+    total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(predictor.data), 1, 1))
     for _ in range(most_steps):
         state = solution.state
         step, own_step, predicted_decrease = levenberg_marquardt_step(solution.cross_products, problem, state, 0.0)
-        # The columns C and r of a trial become C and r − CΔ.
-        changes = np.column_stack([own_step, np.append(step, 0.0)[problem.index], -np.ones(len(own_step))])
-        columns = [
-            np.column_stack([of[:, :-1], -of @ change]) for of, change in zip(solution.columns, changes, strict=True)
-        ]
+        change = np.zeros_like(total_change)
+        change[:, :-1, -1] = -np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
+        moved = np.eye(change.shape[-1]) + change
+        products = np.swapaxes(moved, 1, 2)[:, None] @ solution.cross_products @ moved[:, None]
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after, new_level = estimated_at(columns, before)
+        after, new_level = estimated_at(products, before)
         if not new_level >= level - converged_decrease_smooth:  # nor is NaN taken
             break
-        solution, level = after, new_level
+        solution, level, total_change = after, new_level, total_change + change
         if (
             predicted_decrease < converged_decrease_smooth
             and variance_change(before, after.state) < CONVERGED_VARIANCES
         ):
             break
-    return solution, level
+    columns = tuple(of_trial @ change for of_trial, change in zip(solution.columns, total_change, strict=True))
+    return replace(solution, columns=columns), level
 
 
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:

@@ -51,8 +51,7 @@ def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: 
     if relative_sd is not None:
         residual = (residual.T / relative_sd).T
     white = residual.copy()
-    with_predecessor = np.flatnonzero(~first)
-    white[with_predecessor] -= rho * residual[with_predecessor - 1]
+    white[1:] -= (residual[:-1].T * np.where(first[1:], 0.0, rho)).T
     white[first] *= np.sqrt(1 - rho**2)
     return white
 
