@@ -43,20 +43,11 @@ class ArrivalTracker(Tracker):
         """See `Tracker`."""
         width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
         strip = cut_strip(look.luma, look.axis, width_px)
-        min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
         values = strip.brightness()
-        first = np.median(values[:END_FRAMES], axis=0)
-        # 4.0: change, in units of the noise, that counts (chosen)
-        threshold = 4.0 * max(strip.noise, 3.0)
-        changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
-        smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
-        evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
-        ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
-        if len(ever) < 10:
-            raise ValueError("nothing moves along the axis")
-        evidence[:, : ever[0]] = 0.0
-        path = dividing_path(evidence)
-        edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
+        # 4.0: change, in units of the noise, that counts, and number of rows of a column that must have changed (chosen)
+        changed = np.abs(values - np.median(values[:END_FRAMES], axis=0)) > 4.0 * max(strip.noise, 3.0)
+        path = dividing_path((4.0 - changed.sum(axis=1)).astype(np.float32))
+        edge = np.maximum(path, column_after_leap(path)) - 0.5
         smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
         # 0.8, 1.0: random error before it is scaled to the roughness, and slow error, of an arrival (measured)
         return Positions(
