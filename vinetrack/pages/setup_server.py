@@ -37,10 +37,11 @@ from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.report.build import TOKENS, base64_uri
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
-from vinetrack.video.axis import Axis, axis_entry, axis_through
+from vinetrack.video.axis import Axis, axis_entry, axis_through, find_growth_axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
-from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_problems, tracked_facts
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.survey import Keep, measure_recording, size_problems, tracked_facts
 from vinetrack.video.track import Tracking
 
 # ------------------------------------------------------------------------------
@@ -55,7 +56,7 @@ def decoded_clip(path: Path, _changed_ns: int) -> tuple[tuple[bytes, ...], dict[
     height, width = frames.luma.shape[1:]
     found: dict[str, Any] = {"axis": None, "no_axis": ""}
     try:
-        found["axis"] = axis_json(proposed_axis(frames.luma))
+        found["axis"] = axis_json(find_growth_axis(SmallPictures(frames.luma)))
     except RecordingError as error:
         found["no_axis"] = str(error)
     top = float(np.quantile(frames.luma[0], 0.999)) if frames.luma.dtype != np.uint8 else 255.0

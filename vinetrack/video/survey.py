@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.problems import Problem, confirmed
 from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
@@ -28,12 +27,11 @@ from vinetrack.core.units import number
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through, find_growth_axis
+from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.edge import tube_strip
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.small_pictures import SmallPictures, read_event
+from vinetrack.video.small_pictures import read_event
 from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, too_few, track_pixels
 
 if TYPE_CHECKING:
@@ -125,19 +123,6 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     else:
         return None
     return axis_through(through, width_px)
-
-
-def proposed_axis(luma: NDArray[Any]) -> Axis:
-    """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once. Shapes:
-    luma (n_frames, height, width).
-    """
-    small = SmallPictures(luma)
-    axis = find_growth_axis(small)
-    try:
-        outlined = tube_strip(luma, axis, small)
-    except ValueError:
-        return axis
-    return axis if outlined is None else outlined[0].axis
 
 
 # ------------------------------------------------------------------------------

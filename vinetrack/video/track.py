@@ -44,7 +44,7 @@ class ArrivalTracker(Tracker):
         width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
         strip = cut_strip(look.luma, look.axis, width_px)
         values = strip.brightness()
-        # 4.0: change, in units of the noise, that counts, and number of rows of a column that must have changed (chosen)
+        # 4.0: change, in units of the noise, that counts, and rows of a column that must have changed (chosen)
         changed = np.abs(values - np.median(values[:END_FRAMES], axis=0)) > 4.0 * max(strip.noise, 3.0)
         path = dividing_path((4.0 - changed.sum(axis=1)).astype(np.float32))
         edge = np.maximum(path, column_after_leap(path)) - 0.5
