@@ -61,10 +61,7 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
     """Return the length of the motion blur in every frame: smoothed speed times exposure. Shapes: edge (n_frames,) →
     (n_frames,).
     """
-    if len(edge) < 3:
-        return np.zeros(len(edge))
-    speed = np.gradient(edge)
-    smooth = np.convolve(np.pad(speed, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
+    smooth = np.convolve(np.pad(np.gradient(edge), 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     return np.clip(smooth, 0, None) * exposure_frames
 
 
@@ -72,7 +69,7 @@ def moving_frames(edge: Floats) -> Bools:
     """Return the frames in which the edge moves; all frames if fewer than five do. Shapes: edge (n_frames,) →
     (n_frames,).
     """
-    speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
+    speed = np.abs(np.gradient(edge))
     moving = speed > max(0.2, 0.1 * np.sort(speed)[int(0.95 * (len(speed) - 1))])
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
@@ -132,7 +129,7 @@ def clear_of_start(edge: Floats) -> float:
 
 def core_frames(state: EdgeState, fit: Floats) -> Bools:
     """Select the frames that determine the shape of the tip. They are in motion, clear of the start, and fit no worse
-    than most. Shapes: fit (n_frames, 6) → (n_frames,).
+    than most. Shapes: fit (n_frames, 5) → (n_frames,).
     """
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
@@ -145,11 +142,11 @@ def core_frames(state: EdgeState, fit: Floats) -> Bools:
 
 
 def fit_edges(strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS) -> Floats:
-    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6), NaN
+    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 5), NaN
     in the other frames.
     """
     frames = np.flatnonzero(np.isfinite(state.edge) & chosen)
-    out = np.full((len(state.edge), 6), np.nan)
+    out = np.full((len(state.edge), 5), np.nan)
     out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds)
     return out
 
@@ -179,7 +176,7 @@ def residual_sums(
     strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX
 ) -> tuple[Floats, Floats, float]:
     """What a fit leaves in the frames of `use`, by rows, by distances, and its robust misfit, in which a wider blur
-    would not lower its own; see `edge_kernels.residual_sums`. Shapes: fit (n_frames, 6); use (n_frames,).
+    would not lower its own; see `edge_kernels.residual_sums`. Shapes: fit (n_frames, 5); use (n_frames,).
     """
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
@@ -200,7 +197,7 @@ OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel t
 def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur. Both come from
     the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
-    them. Shapes: fit (n_frames, 6).
+    them. Shapes: fit (n_frames, 5).
     """
     largest_lag_step_px = 4.0  # Largest change of a row's lag in one round (chosen)
     core = core_frames(state, fit)
@@ -233,7 +230,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate what the tip shows beyond film and background, by distance ahead of the edge. A round tip is lit
     differently from the tube behind it: its rim may be as bright as the background where the film is darker, and the
-    edge would be fitted behind the rim. Shapes: fit (n_frames, 6).
+    edge would be fitted behind the rim. Shapes: fit (n_frames, 5).
     """
     core = core_frames(state, fit)
     for _ in range(2):
@@ -317,7 +314,7 @@ LEAST_FITTED_AMPLITUDE = 0.5
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> Floats:
     """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
     the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
-    more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
+    more. Shapes: fit (n_frames, 5); chosen (n_frames,) → (n_frames, 5).
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -352,7 +349,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
                 continue  # two to four whole steps: frames are missing, and the point is right
             elif replacement is None:
                 expected = previous if math.isnan(edge[t]) else edge[t]
-                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0, 0)
+                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0)
             else:
                 out[t] = replacement
             edge[t] = float(out[t, 0])
@@ -364,7 +361,7 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
     the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. Shapes: edge (n_frames,) → (n_frames,).
     """
-    if len(edge) < 3 or exposure_frames <= 0:
+    if exposure_frames <= 0:
         return np.zeros(len(edge))
     steps = np.abs(np.diff(np.pad(np.nan_to_num(edge), 2, mode="edge")))
     speed = np.maximum(steps[:-3], steps[3:])
@@ -437,7 +434,7 @@ def _near_start(edge: Floats) -> Bools:
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
     picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
-    6); misfit_ratio, edge (n_frames,) → (n_frames,).
+    5); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 2.4, 1.6: misfit, over the usual one and in itself, above which a frame differs from those clear of the start
@@ -713,7 +710,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     usual = max(float(np.nanmedian(fit[core_frames(state, fit), 2])), 1e-3)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
-    acceleration = np.gradient(np.gradient(fit[:, 0])) if len(fit) > 4 else np.zeros(len(fit))
+    acceleration = np.gradient(np.gradient(fit[:, 0]))
     edge = fit[:, 0] - np.clip(acceleration, -50, 50) * exposure**2 / 24
     # 5: frames of whose errors the median is taken, so that few bands do not agree by chance (chosen)
     scatter = np.nan_to_num(fit[:, 1], nan=ASTRAY_PX)

@@ -141,20 +141,18 @@ def fit_edges(
     blur: float, appearance: np.ndarray, prior_sd: float, margin: float, rounds: int,
     shading: np.ndarray, frames: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6). Columns of
-    the result: edge, its standard error, mean squared weighted residual, amplitude − 1, level, number of pixels. The
-    standard error is that of a sandwich (Huber 1967): the scatter of what the residuals of bands of rows would move
-    the edge by, whatever made them. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along).
+    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 5). Columns of
+    the result: edge, its standard error, mean squared weighted residual, amplitude − 1, level. The standard error is
+    that of a sandwich (Huber 1967): the scatter of what the residuals of bands of rows would move the edge by,
+    whatever made them. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along).
     """
     columns, bands = strip.shape[2], np.zeros((min(BANDS, strip.shape[1]), 3))
-    out = np.full((len(frames), 6), np.nan)
+    out = np.full((len(frames), 5), np.nan)
     max_lag = lag.max()
     half, middle, table_length = 0.0, 0, -1.0
     table, shading32 = np.empty((0, 0, 0), np.float32), shading.astype(np.float32)
     for i in range(len(frames)):
         t, y = frames[i], start[i]
-        if not math.isfinite(y):
-            continue
         length = max(lengths[t], MIN_MOTION_BLUR_PX)
         if length != table_length:
             table_length = length
@@ -190,7 +188,6 @@ def fit_edges(
             curvature = info * max(1 - less / yy, 0.3)
             out[i, 1] = math.sqrt(moved * len(bands) / max(len(bands) - 1, 1)) / curvature
             out[i, 2] = chi / max(used, 1.0)
-            out[i, 5] = used
             if abs(step) < 1e-3:
                 break
         out[i, 0], out[i, 3], out[i, 4] = y, amplitude, level
@@ -370,7 +367,7 @@ def residual_sums(
     """Sums over the pixels about the edge of what a fit leaves, r, with the weights w of the fit. Of each row, w r d
     and w d², with d the derivative of the model by the row's lag, shape (2, n_across); at each distance ahead of the
     row's own edge, in the bins of `shading`, w r and w, (2, n_distances): a pixel counts in the two bins between which
-    it lies; and the mean of log(1 + r²/9v), v the mean of both variances. Shapes: fit (n_frames, 6); frames (n_used,).
+    it lies; and the mean of log(1 + r²/9v), v the mean of both variances. Shapes: fit (n_frames, 5); frames (n_used,).
     """
     _, rows, columns = strip.shape
     of_rows, of_distances, total, count = np.zeros((2, rows)), np.zeros((2, len(shading))), 0.0, 0

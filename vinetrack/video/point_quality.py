@@ -36,8 +36,6 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats) -> Floats:
     have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard
     deviation; it stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px (n_frames,) → (n_frames,).
     """
-    if len(edge_px) < 5:
-        return sigma_px
     windows = np.lib.stride_tricks.sliding_window_view
     difference = windows(edge_px, 5) @ FOURTH_DIFFERENCE
     expected = np.sqrt(windows(sigma_px**2, 5) @ FOURTH_DIFFERENCE**2)
