@@ -382,29 +382,21 @@ def _on_front(along: Pixels, band: float, slack: float) -> Bools:
 # The curve along which a vine grew, from the pixels that changed, in the order in which they did.
 #
 # Those that change at about the same time lie across the vine at its tip: the smoothed line through their middles is
-# the path. It is used only where its front share is larger than that of the best straight line, or as large in a
-# narrower band.
+# the path. It is used only where its front share, over its width, is larger than that of the best straight line.
 
 
 def find_growth_axis(small: SmallPictures) -> Axis:
-    """Find the growth axis from the motion: a straight line, or a curve where that explains more of the change."""
-    straight: Axis | RecordingError
+    """Find the growth axis from the motion: a straight line, or a curve where that explains more in less width."""
+    curve = find_curve(small)
+    if curve is None or min(front_share_of_picture(small, curve), front_share(small, curve)) < LEAST_FRONT_SHARE:
+        return find_axis(small)
     try:
         straight = find_axis(small)
-    except RecordingError as error:
-        straight = error
-    if (curve := find_curve(small)) is not None:
-        # 1.25, 0.98, 1.35: a curve is used where the straight line needs a band this many times wider and the curve
-        # explains at least this part of what the line does, else where it explains this many times as much (measured)
-        needed = LEAST_FRONT_SHARE
-        if isinstance(straight, Axis):
-            gain = 0.98 if straight.width_px > 1.25 * curve.width_px else 1.35
-            needed = max(needed, gain * front_share_of_picture(small, straight))
-        if front_share_of_picture(small, curve) >= needed and front_share(small, curve) >= LEAST_FRONT_SHARE:
-            return curve
-    if isinstance(straight, RecordingError):
-        raise straight
-    return straight
+    except RecordingError:
+        return curve
+    of_curve, of_line = (front_share_of_picture(small, axis) / axis.width_px for axis in (curve, straight))
+    # 1.27: least ratio of what curve and line explain in a band of one width (measured)
+    return curve if of_curve > 1.27 * of_line else straight
 
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
