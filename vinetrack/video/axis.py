@@ -395,8 +395,8 @@ def find_growth_axis(small: SmallPictures) -> Axis:
     except RecordingError:
         return curve
     of_curve, of_line = (front_share_of_picture(small, axis) / axis.width_px for axis in (curve, straight))
-    # 1.27: least ratio of what curve and line explain in a band of one width (measured)
-    return curve if of_curve > 1.27 * of_line else straight
+    # 1.3: least ratio of what curve and line explain in a band of one width (measured)
+    return curve if of_curve > 1.3 * of_line else straight
 
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
