@@ -37,7 +37,6 @@ TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
-AROUND_PX = 64.0  # Distance from the edge's way up to which film and background are asked (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
@@ -95,7 +94,6 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     passing_px = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
     behind = np.maximum(places + passing_px + float(state.lag.max()), clear_of_start(state.edge))
     early = np.clip(np.interp(places - passing_px, monotone, frames), begin, end)
-    early[(places < state.edge.min() - AROUND_PX) | (places > state.edge.max() + AROUND_PX)] = np.inf
     late = np.clip(np.interp(behind, monotone, frames), begin, end)
     # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
     reach = 0.5 * state.lengths + 2.06 * state.blur
@@ -281,8 +279,7 @@ def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
         vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
         if foremost.min() <= vertex + middle <= foremost.max():
             lead = float(np.polyval(curve, vertex))
-    # 60.0: largest lag of a row behind the foremost point (chosen)
-    return np.clip(smooth - lead, -3.0, 60.0), lead
+    return smooth - lead, lead
 
 
 def _least_misfit(candidates: Floats, misfits: Floats) -> float:
@@ -696,8 +693,8 @@ def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], passed: t
     contrast = np.abs(appearance[0] - appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width)
-    evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
-    return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
+    # 25, 2: columns behind the first passed one, and ahead of the last, up to which it may lie (chosen)
+    return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
 
 
 BANDS_ERROR = 0.9  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)

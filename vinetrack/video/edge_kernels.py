@@ -80,8 +80,6 @@ def subpixel_index(place: float) -> tuple[int, int, float]:
 
 
 BANDS = 6  # Bands of rows from whose scatter the error of an edge is taken; 4 to 20 do as well (measured)
-COLUMNS_BEHIND = 25  # Columns behind the first passed one that are used (chosen)
-COLUMNS_AHEAD = 50  # Columns ahead of the last passed one that are used (chosen)
 FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
 
 
