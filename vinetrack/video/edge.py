@@ -37,6 +37,7 @@ TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
+AROUND_PX = 64.0  # Distance from the edge's way up to which film and background are asked: a fifth of the time (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
@@ -94,6 +95,7 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     passing_px = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
     behind = np.maximum(places + passing_px + float(state.lag.max()), clear_of_start(state.edge))
     early = np.clip(np.interp(places - passing_px, monotone, frames), begin, end)
+    early[(places < state.edge.min() - AROUND_PX) | (places > state.edge.max() + AROUND_PX)] = np.inf
     late = np.clip(np.interp(behind, monotone, frames), begin, end)
     # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
     reach = 0.5 * state.lengths + 2.06 * state.blur
