@@ -153,7 +153,6 @@ def test_a_straight_vine_keeps_the_straight_axis_it_had(changes):
 
 @pytest.mark.parametrize(("share", "width_px", "bends"), [(0.65, 30.0, True), (0.9, 48.0, False)])
 def test_a_curve_is_the_axis_where_it_explains_more_in_a_band_of_one_width(monkeypatch, share, width_px, bends):
-    """Than a line 40 px wide that explains 0.65 of the change."""
     found = {"find_axis": Axis((20.0, 30.0), (220.0, 30.0), 40.0), "find_curve": replace(quarter(), width_px=width_px)}
     for name, axis in found.items():
         monkeypatch.setattr(curves, name, lambda _, axis=axis: axis)
