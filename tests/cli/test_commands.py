@@ -184,7 +184,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(tmp_path, monkeypatch)
 
 # Every command that reads results, on those of films and of tracks, with a trial left out.
 VINE = "--diameter-mm 24 --length-mm 280 --pressure-kPa 30 --chamber-l 2"
-COMMANDS = f"""compare RESULTS; diagnose RESULTS; power RESULTS; power RESULTS --effect air_drag; add air_drag RESULTS;
+COMMANDS = f"""compare RESULTS; diagnose RESULTS; power RESULTS; power RESULTS air_drag; add air_drag RESULTS;
 predict --fit RESULTS {VINE} --thickness-um 200; design reservoir --fit RESULTS {VINE};
 design vine --fit RESULTS --pressure-kPa 40 --chamber-l 2 --samples 50"""
 

@@ -221,6 +221,13 @@ def test_what_trials_share_stays_where_their_number_grows():
         assert fit_result.Number.from_json(one.to_json()).shared == one.shared
 
 
+def test_what_trials_share_is_no_more_than_the_whole_error():
+    """Of two errors little more than the sum is known; the first unknown is half their difference, and noise."""
+    covariance = np.array([[1.05, 0.95, -0.95], [0.95, 1.0, -0.9], [-0.95, -0.9, 1.0]])
+    parts = errors.shared_parts(covariance, np.array(["", "lens", "payloads"]))
+    assert [part[0] for part in parts.values()] == pytest.approx([0.475, 0.475])
+
+
 @pytest.mark.slow
 def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
     """The sheet's value is part of the fitted one: the difference has its variance less that of the fit."""

@@ -152,11 +152,11 @@ def test_a_diagnosis_appears_when_the_page_is_opened_again(campaign, background,
     own = BackgroundFit(open_campaign(folder, campaign.experiment.folder))
     own.prediction, own.fitted = background.prediction, background.fitted
     page = Browser(own)
-    assert f"vinetrack diagnose {folder}" in page.text("tied")
+    assert f"vinetrack diagnose {folder}" in page.text("verdict")
     page.page.close()
     write_diagnosis(folder)
     again = Browser(own)
-    assert "(cosine 0.970)" in again.text("tied")
+    assert f"<b>{again.page.diagnosis.verdict}</b>" in again.text("verdict")
     assert "chamber (l)" in again.text("next")
     assert again.page.panel.root.children[0].children[0].label == "Suspected by the diagnosis"
     known = again.page.diagnosis
@@ -198,7 +198,7 @@ def test_after_unexplained_the_command_is_named_and_an_effect_of_ones_own_is_sav
     with (folder / "experiment.yaml").open("a", encoding="utf-8") as settings:
         settings.write("effects: [spring_line.py]\n")
     page = Browser(fitted(open_campaign(results, folder)))
-    assert "vinetrack propose" in page.text("tied")
+    assert "vinetrack propose" in page.text("verdict")
     page.page.choice = page.page.choice.with_effect("spring_line")
     page.click("save")
     assert "Saved." in page.text("saved")

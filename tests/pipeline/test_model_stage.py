@@ -180,7 +180,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder, 
     planned(tmp_path, "limits: {pressure_kPa: 14:40, new_vines: no}\n")
     now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
-    assert "of campaigns" in succeed("power", tmp_path, "--effect", size, "--reach", "0.9", "--sheet", rows)
+    assert "of campaigns" in succeed("power", tmp_path, size, "--reach", "0.9", "--sheet", rows)
     pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(tmp_path / "trials.csv", index=False)
     again = power_of_target(PowerRequest(tmp_path))["leak"]
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88

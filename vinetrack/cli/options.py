@@ -170,7 +170,7 @@ def _parameter(line: Mapping[str, str]) -> inspect.Parameter:
     value = False if kind == "flag" and not default else None if value == "null" else value
     said: dict[str, Any] = {"help": line["help"], "metavar": line["metavar"] or None}
     said["show_default"] = value is not None and value is not False
-    required = not line["option"] and not default
+    required = not line["option"] and not default and kind != "texts"
     if line["option"]:
         info = typer.Option(line["option"], rich_help_panel=line["panel"] or None, **said, **bounds)
     else:

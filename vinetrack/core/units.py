@@ -107,7 +107,7 @@ UNITS = {
     name: Unit(si, text[0].replace("_", " ") if text else name, *map(float, scale.split("/")))
     for si, units in {
         "Pa": "Pa=1 mbar=100 kPa=1000 psi=6894.757293168361 bar=1e5 MPa=1e6",
-        "m": "nm=1/1e9 um=1/1e6=µm mm=1/1000 cm=1/100 in=25.4/1000 ft=304.8/1000 m=1=metres",
+        "m": "nm=1/1e9 um=1/1e6=µm mil=25.4/1e6 mm=1/1000 cm=1/100 in=25.4/1000 ft=304.8/1000 m=1=metres",
         "kg": "mg=1/1e6 g=1/1000 oz=28.349523125/1000 lb=453.59237/1000 kg=1",
         "s": "ns=1/1e9 us=1/1e6=µs ms=1/1000 s=1",
         "m3": "ml=1/1e6 cm3=1/1e6=cm³ l=1/1000=litres m3=1=m³",

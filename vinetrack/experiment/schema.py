@@ -187,13 +187,9 @@ def option(column: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Suggest the three known names most similar to an unknown one."""
-    nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
-    if not nearest:
-        return ""
-    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
-        return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
-    return f"did you mean {nearest[0]}?"
+    """Suggest the known name that an unknown one may misspell."""
+    close = difflib.get_close_matches(name, list(known), 1, CLOSE_NAME_RATIO)
+    return f"did you mean {close[0]}?" if close else "vinetrack settings lists all names"
 
 
 def value_and_unit(cell: str, name: str) -> tuple[str, str]:

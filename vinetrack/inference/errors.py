@@ -283,17 +283,30 @@ def widened_covariance(
     )
     unknown = np.flatnonzero(~np.isfinite(np.diag(model_precision.covariance)))
     covariance[unknown, unknown] = np.inf
-    # What the parameters would be known better by if the errors from a source were known.
-    source_of, shared = np.array([""] * (len(plain) - len(sources)) + list(sources)), {}
-    for source in dict.fromkeys(sources):
-        across = plain[:, source_of == source]
-        known = np.linalg.pinv(plain[np.ix_(source_of == source, source_of == source)], hermitian=True)
-        shared[source] = np.sum((across @ known) * across, axis=1) * ratio**2
+    source_of = np.array([""] * (len(plain) - len(sources)) + list(sources))
+    shared = {source: part * ratio**2 for source, part in shared_parts(plain, source_of).items()}
     if solution.problem.own_errors:
         exact = _with_known_pressures(solution)
         known_by = np.diag(_covariance_by_noise(exact, trial_information(exact)[0]))
         shared["gauge"] = np.maximum(diagonal - known_by, 0.0) * ratio**2
     return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
+
+
+def shared_parts(covariance: Floats, source_of: np.ndarray) -> dict[str, Floats]:
+    """What the variances of unknowns would lose if the errors from a source were known, by source, (n_unknowns,); of
+    all sources as much as if all were known: where only a sum of errors is determined, each tells the others.
+    `source_of` (n_unknowns,) is blank for what is no error.
+    """
+
+    def known_by(chosen: np.ndarray) -> Floats:
+        across = covariance[:, chosen]
+        known = np.linalg.pinv(covariance[np.ix_(chosen, chosen)], hermitian=True)
+        return np.asarray(np.sum((across @ known) * across, axis=1))
+
+    parts = {str(source): known_by(source_of == source) for source in dict.fromkeys(source_of[source_of != ""])}
+    apart = sum(parts.values(), np.zeros(len(covariance)))
+    together = np.divide(known_by(source_of != ""), apart, out=np.ones_like(apart), where=apart > 0)
+    return {source: part * together for source, part in parts.items()}
 
 
 def _with_known_pressures(solution: Solution) -> Solution:

@@ -57,7 +57,7 @@ from vinetrack.pages.plots import (
     vine_colours,
 )
 from vinetrack.pipeline.workflow import command_for_results
-from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment, tied_pairs
+from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
 # ------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ class Page:
     def _build(self) -> None:
         campaign = self.campaign
         self.headline, self.status = bk.Div(name="headline"), bk.Div(name="status")
-        self.numbers, self.tied, self.next = bk.Div(name="numbers"), bk.Div(name="tied"), bk.Div(name="next")
+        self.numbers, self.verdict, self.next = bk.Div(name="numbers"), bk.Div(name="verdict"), bk.Div(name="next")
         self.selector = TrialSelector(campaign, self._selection_changed)
         self.plots = Plots(campaign, self.selector.toggle)
         self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
@@ -306,7 +306,7 @@ class Page:
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
         buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
         actions = bk.Column(buttons, name="actions")
-        texts = [self.headline, self.status, self.numbers, self.tied, self.next]
+        texts = [self.headline, self.status, self.numbers, self.verdict, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
         panels = [self.selector.root, self.panel.root, self.film.root]
         for root in (*texts, *figures, *panels, actions, bk.Column(save, self.saved, name="keep")):
@@ -490,13 +490,12 @@ class Page:
                 held, now = self.held[1], self._described(self.shown)
                 compared = [(title, held.get(title, "–"), now.get(title, "–")) for title in held | now]
         set_text(self.numbers, numbers_panel(self.fits, self._sizes_changed, compared))
-        diagnosis, rows, pairs, advice = self.diagnosis, list[Row](), list[str](), None
+        diagnosis, rows, advice = self.diagnosis, list[Row](), None
         if diagnosis is not None:
             rows = verdict_table(diagnosis)
             advice = next_experiment(diagnosis.next_experiment)
-            pairs = tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else pairs
         command = shlex.join(["vinetrack", "diagnose", self.campaign.folder.as_posix()])
-        set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, rows=rows, pairs=pairs))
+        set_text(self.verdict, panel("verdict", diagnosis=diagnosis, diagnose=command, rows=rows))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
 
     def _update_status(self) -> None:

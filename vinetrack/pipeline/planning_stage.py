@@ -544,9 +544,9 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
         for text, (name, value) in zip(request.effects, asked, strict=True):
             if name in power.not_testable:
                 why = str(power.not_testable[name])
-                raise refusal("--effect", text, "cannot be tested with the columns of these trials", why)
+                raise refusal("effect", text, "cannot be tested with the columns of these trials", why)
             if not math.isfinite(value):
-                raise refusal("--effect", text, "needs a size", "write the size to detect, such as leak=0.5")
+                raise refusal("effect", text, "needs a size", "write the size to detect, such as leak=0.5")
             with waiting(f"searching for trials that detect {name}"):
                 plan = further_trials(tests, power[name], value, request.reach, limits)
             power = replace(power, further=(*power.further, plan))
@@ -560,17 +560,16 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
         return name, math.nan
     known = {entry.effect: display_unit(entry.unit, entry.pressure_unit) for entry in power.effects}
     if name not in known:
-        candidates = sorted([*known, *power.not_testable])
-        close = difflib.get_close_matches(name, candidates, 1, 0.6)
-        remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
+        close = difflib.get_close_matches(name, [*known, *power.not_testable], 1, 0.6)
+        remedy = f"did you mean {close[0]}?" if close else "without a name, vinetrack power lists the candidates"
         message = "is in the model already" if name in power.model else "is not a candidate for these trials"
-        raise refusal("--effect", name, message, remedy)
+        raise refusal("effect", name, message, remedy)
     unit, factor = known[name]
     try:
         return name, float(size or "nan") / factor
     except ValueError:
         remedy = f"write a number in {unit or 'the unit of the parameter'}"
-        raise refusal("--effect", text, "is not a size", remedy) from None
+        raise refusal("effect", text, "is not a size", remedy) from None
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:

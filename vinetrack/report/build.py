@@ -20,7 +20,7 @@ import numpy as np
 from markupsafe import Markup
 
 from vinetrack.core.units import display_unit, interval, number, pressure_text, with_error
-from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
+from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
@@ -189,7 +189,7 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "rounds": rounds,
         "hidden": hidden,
         "power": power and {"sentences": told, "sizes": sizes, "columns": columns},
-        "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
+        "tied": tied_pairs(diagnosis),
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
     }
@@ -213,16 +213,17 @@ def upper_limits(
     return limits
 
 
-def tied_pairs(entry: Round) -> list[str]:
-    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
-    names = list(map(spaced_name, entry.cosines.effects))
+def tied_pairs(diagnosis: Diagnosis) -> str:
+    """Return the pairs of candidates with nearly proportional effects on the trajectories, those of largest cosine."""
     pairs = [
-        (abs(value), f"{names[j]} and {names[i]} (cosine {number(value)})")
+        (abs(value), f"{spaced_name(entry.cosines.effects[j])} and {spaced_name(entry.cosines.effects[i])}")
+        for entry in diagnosis.rounds[:1]
         for i, row in enumerate(entry.cosines.matrix)
         for j, value in enumerate(row[:i])
         if is_finite(value) and abs(value) >= 0.95  # above it two candidates count as tied (chosen)
     ]
-    return [text for _, text in sorted(pairs, reverse=True)]
+    # 3: as many as a sentence has room for; diagnosis.json has all
+    return "; ".join(f"{text} (cosine {number(value)})" for value, text in sorted(pairs, reverse=True)[:3])
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:

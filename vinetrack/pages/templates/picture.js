@@ -375,7 +375,7 @@ export function drawProblems() {
 
 $("frame").oninput = (event) => showFrame(Number(event.target.value));
 $("source").onchange = (event) => showPicture(event.target.value);
-$("tools").oninput = () => (chosen("tool") === "scale" && !state.calibration && !marks.from_px && state.pictures.length ? showPicture(state.pictures[0]) : redraw());
+$("tools").oninput = () => (chosen("tool") === "scale" && !view.source && state.pictures.length ? showPicture(state.pictures[0]) : redraw());
 $("turned").onclick = ({target}) => {
   if (!target.value) return;
   state.shared.growth_angle_deg = target.value;

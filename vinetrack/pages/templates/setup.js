@@ -15,8 +15,10 @@ function choose(i) {
 const showWhole = (extra = []) => $("whole").replaceChildren(...listed([...extra, ...state.problems.filter((problem) => problem.field === "whole")]));
 
 function showState() {
-  const errors = state.problems.filter((problem) => problem.severity === "error").length;
-  const warnings = state.problems.length - errors;
+  // What several recordings contradict is one thing to correct.
+  const things = new Map(state.problems.map((problem) => [problem.of_a_measurement ? problem.column : problem, problem]));
+  const errors = [...things.values()].filter((problem) => problem.severity === "error").length;
+  const warnings = things.size - errors;
   // Until the recordings were compared only the sheet was checked: whether they agree with it is not known yet.
   const ready = state.compared ? "ready to run" : "complete; Check compares them with the recordings";
   const todo = `${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct`;

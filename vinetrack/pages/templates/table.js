@@ -197,6 +197,7 @@ export function markProblems() {
     cell.classList.add(severity === "error" ? "bad" : "odd");
     const alike = of_a_measurement ? `${severity} ${column}` : text, again = told.has(alike);
     told.add(alike);
+    if (of_a_measurement && !again) placeless.push({severity, text: `${trial}: ${text}`}); // a cell may be scrolled away
     const short = blank ? "to be filled in" : again ? "likewise" : text.replace(new RegExp(`^${column} `), "");
     cell.append(el("small", {class: `said ${severity}`, title: text}, short));
     input.setAttribute("aria-invalid", severity === "error");
