@@ -180,7 +180,7 @@ def test_a_track_does_not_follow_the_payload(flight):
     assert with_flag(tracking.track.flag, "after_end")[last + 2 :].all()
 
 
-@pytest.mark.parametrize(("length_px", "complete"), [(405, True), (395, True), (430, False), (370, False)])
+@pytest.mark.parametrize(("length_px", "complete"), [(395, True), (430, True), (460, False), (370, False)])
 def test_travel_is_compared_with_the_length(length_px, complete):
     edge_px = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
     slot = np.arange(edge_px.size)

@@ -130,9 +130,9 @@ class Ending:
     name: str = ""
 
     def notes(self, length_px: float) -> list[str]:
-        """What a track is told about its end; nothing where the whole vine has grown, or most of it was recorded."""
-        # 0.03: relative difference of travel and length within which the whole vine has grown; 0.9: most of it (chosen)
-        if abs(self.grown_px / length_px - 1) < 0.03 or self.truncated_px / length_px > 0.9:
+        """What a track is told about its end; nothing where most of the vine has grown."""
+        # 0.9: most of the length in the sheet, which may count what is clamped; 1.03: more than the vine has (chosen)
+        if 0.9 < np.fmax(self.grown_px, self.truncated_px) / length_px < 1.03:
             return []
         share = f", after {self.truncated_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
         moves = f"{self.name}: the recording ends while the leading edge moves{share}"
