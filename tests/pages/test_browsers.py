@@ -194,12 +194,8 @@ def test_the_marks_of_a_ruler_are_proposed_and_how_the_camera_was_turned_is_aske
     person.press("input[name=tool][value=scale]")
     person.said("#marks-step", "marks found")
     person.chrome.run("document.querySelector('#spacing').focus()")
-    for text, said in (("10", "1 thing"), ("1", "ready to run")):  # ten times too long by both recordings
-        person.chrome.run("document.querySelector('#spacing').select()")
-        person.chrome.send("Input.insertText", text=text)
-        person.said("#headline", "complete")
-        person.press("#check")
-        person.said("#headline", said)
+    person.chrome.send("Input.insertText", text="1")
+    person.said("#headline", "complete")
     # What is saved meanwhile leaves the result of the check.
     person.press("#check")
     person.save()

@@ -293,9 +293,8 @@ def widened_covariance(
 
 
 def shared_parts(covariance: Floats, source_of: np.ndarray) -> dict[str, Floats]:
-    """What the variances of unknowns would lose if the errors from a source were known, by source, (n_unknowns,); of
-    all sources as much as if all were known: where only a sum of errors is determined, each tells the others.
-    `source_of` (n_unknowns,) is blank for what is no error.
+    """What the variances of unknowns would lose if the errors from a source, blank for none, were known, (n_unknowns,);
+    in all as much as if all were: where only a sum of errors is determined, each tells the others.
     """
 
     def known_by(chosen: np.ndarray) -> Floats:

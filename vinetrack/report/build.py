@@ -214,7 +214,7 @@ def upper_limits(
 
 
 def tied_pairs(diagnosis: Diagnosis) -> str:
-    """Return the pairs of candidates with nearly proportional effects on the trajectories, those of largest cosine."""
+    """Return the pairs of candidates with nearly proportional effects on the trajectories, three of largest cosine."""
     pairs = [
         (abs(value), f"{spaced_name(entry.cosines.effects[j])} and {spaced_name(entry.cosines.effects[i])}")
         for entry in diagnosis.rounds[:1]
@@ -222,7 +222,6 @@ def tied_pairs(diagnosis: Diagnosis) -> str:
         for j, value in enumerate(row[:i])
         if is_finite(value) and abs(value) >= 0.95  # above it two candidates count as tied (chosen)
     ]
-    # 3: as many as a sentence has room for; diagnosis.json has all
     return "; ".join(f"{text} (cosine {number(value)})" for value, text in sorted(pairs, reverse=True)[:3])
 
 
