@@ -35,7 +35,7 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors():
     table = pd.concat([table.assign(trial=name) for name in "ab"])
     growth, left = figures.draw_before_after("24 kPa", table, "air drag").axes
     shown = [text.get_text() for text in growth.get_legend().get_texts()]
-    assert shown == ["measured, N = 2", "initial model: 8.0 mm rms", "with air drag: 1.0 mm rms"]
+    assert shown == ["measured, N = 2", "model in use: 8.0 mm rms", "with air drag: 1.0 mm rms"]
     assert {to_hex(line.get_color()) for line in left.lines} >= {figures.BEFORE.lower(), figures.AFTER.lower()}
     assert left.lines[0].get_ydata()[-1] == pytest.approx(8.0)
 

@@ -183,9 +183,8 @@ def test_a_track_does_not_follow_the_payload(flight):
 @pytest.mark.parametrize(("length_px", "complete"), [(395, True), (430, True), (460, False), (370, False)])
 def test_travel_is_compared_with_the_length(length_px, complete):
     edge_px = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
-    slot = np.arange(edge_px.size)
     quality = PointQuality(np.full(56, "", dtype="<U64"), (), 10, 49, None, np.zeros(56, dtype=bool))
-    ending = ending_of(quality, edge_px, "a.mp4", slot, whole=True)
+    ending = ending_of(quality, edge_px, "a.mp4", np.arange(56), whole=True)
     assert ending.remark
     assert (ending.notes(length_px) == []) is complete
 

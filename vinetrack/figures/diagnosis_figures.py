@@ -75,13 +75,13 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
 
 @figure("before_after", "verdict", "The worst condition", data="before_after")
 def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Figure | None:
-    """The condition that the initial model predicts worst. Above, growth of the leading edge since release: every
+    """The condition that the model in use predicts worst. Above, growth of the leading edge since release: every
     replicate (dots), the model before (dashed) and with what was added (full). Below, the misfit, measured minus
     model. Release and origin are fitted for each trial.
     """
     if before_after.empty:
         return None
-    models: dict[str, tuple[str, Any, str]] = {"model_before_m": (BEFORE, (0, (5, 2)), "initial model")}
+    models: dict[str, tuple[str, Any, str]] = {"model_before_m": (BEFORE, (0, (5, 2)), "model in use")}
     if np.isfinite(before_after["model_after_m"]).any():
         models["model_after_m"] = (AFTER, "-", f"with {added}" if added else "after")
     fig = st.new_figure(5.2, 4.3)  # two such figures fit side by side on a page of 11 in

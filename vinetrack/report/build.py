@@ -493,7 +493,7 @@ def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFr
     note = " The condition is the one that the model predicts worst." if len(chosen) < len(with_clip) else ""
     edges = "the tracked edge (yellow)"
     if diagnosed is not None:
-        edges += ", that of the initial model (vermillion)"
+        edges += ", that of the model in use (vermillion)"
         edges += f", and that with {diagnosed.added} (blue)" if diagnosed.added else ""
     caption = f"The recording, slowed down, with {edges}.{note}"
     return {"trial": name, "caption": caption, "mp4": path.read_bytes(), "poster": poster.getvalue()}

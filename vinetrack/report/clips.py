@@ -107,7 +107,7 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
         predicted, to_px = read_result(path), position_to_px(track)
         diagnosis = read_diagnosis(results)
         added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
-        models = [("model_before_m", "initial model", BEFORE, 2.0)]
+        models = [("model_before_m", "model in use", BEFORE, 2.0)]
         models += [("model_after_m", f"with {added}", AFTER, 1.4)] if added else []
         time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
         for column, label, colour, reach in models:
