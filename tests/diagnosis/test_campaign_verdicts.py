@@ -297,7 +297,7 @@ def test_a_bare_vine_of_light_film_cannot_tell():
     bare = filmed(Vine(12, 100, 140), (24, 30, 38, 48), 0, 90, 0)
     told = diagnosed([(replace(t, position_systematic_m=1e-4), track) for t, track in bare], ANGLE_RIVALS)
     assert told.verdict == "adequate"
-    assert row_of(told, "growth_angle").status == result.NOT_TESTABLE
+    assert row_of(told, "growth_angle").largest["growth_angle.f"] > 1.2  # the largest plausible
 
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
