@@ -57,6 +57,8 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
     grey, dictionary = eight_bits(picture), _dictionary(board.dictionary)
     corners, ids = _detect_markers(grey, dictionary)
+    if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
+        corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
     share, marker_mm, layout = _best_layout(corners, ids, board, dictionary) if len(ids) else (0.0, math.nan, None)
     # 0.10: relative difference above which markers were printed at another size (chosen)
     if layout is None or share < LEAST_IN_PLACE or abs(marker_mm / board.marker_mm - 1) > 0.10:
@@ -79,13 +81,16 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
 
     grey, (across, down) = eight_bits(picture), board.squares
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    for columns, rows in dict.fromkeys([(across, down), (down, across)]):
-        # The sector-based detector (Duda & Frese 2018)
-        seen, found_px = cv2.findChessboardCornersSB(grey, (columns - 1, rows - 1), flags=flags)
-        if seen:
+    for enlarge in (1, 2):
+        for columns, rows in dict.fromkeys([(across, down), (down, across)]):
+            # The sector-based detector (Duda & Frese 2018)
+            shape = (columns - 1, rows - 1)
+            seen, found_px = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), shape, flags=flags)
+            if not seen:
+                continue
+            found_px = _in_original(found_px.reshape(-1, 2), enlarge)
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
-            grid_m = grid.astype(float) * (board.square_mm / 1000)
-            return _enough(found_px.reshape(-1, 2).astype(float), grid_m, "all are seen")
+            return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
     raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
 
 
@@ -119,6 +124,18 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
     return (grid.shape[1] + 1, grid.shape[0] + 1) if max(bends) < 0.1 * step else None
 
 
+def _enlarged(grey: Grey, times: int) -> Grey:
+    """The picture, or a larger copy for squares that are only a few pixels wide."""
+    import cv2
+
+    return np.asarray(cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC))
+
+
+def _in_original(corners_px: NDArray[Any], times: int) -> Floats:
+    """Convert places in an enlarged copy: its pixel 0 is centred on ½/times − ½ of the picture's."""
+    return (np.asarray(corners_px, dtype=float) + 0.5) / times - 0.5
+
+
 def _dictionary(name: str) -> Any:
     """A dictionary of markers by its name in OpenCV."""
     import cv2
@@ -145,17 +162,16 @@ def _best_layout(
     return max(found, key=lambda agreement: agreement[0])
 
 
-def _detect_markers(grey: Grey, dictionary: Any) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1); sought in the picture twice as
-    large, whose pixel 0 is centred on −¼, for squares that are only a few pixels wide.
-    """
+def _detect_markers(
+    grey: Grey, dictionary: Any, enlarge: int = 1
+) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+    """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1)."""
     import cv2
 
-    twice = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(twice)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(_enlarged(grey, enlarge))
     if ids is None:
         return [], np.empty((0, 1), np.int32)
-    return [np.asarray(corner / 2 - 0.25, np.float32) for corner in corners], np.asarray(ids)
+    return [_in_original(corner, enlarge).astype(np.float32) for corner in corners], np.asarray(ids)
 
 
 def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], board: Charuco) -> tuple[float, float]:
