@@ -55,6 +55,7 @@ EDGES = {
     "low contrast": ({"film": 100.0, "wall_sd": 4.0, "tail_sd": 3.0}, 0.2, 0.25),
     "half-frame exposure": ({"speed": 30.0, "exposure": 0.5, "rise_frames": 4.0}, 0.3, 0.35),
     "sway": ({"wobble": 2.0}, 0.15, 0.2),
+    "payload flies ahead": ({"payload": True}, 0.15, 0.2),
     "contrast changes sign": ({"gradient": 110.0, "film": 125.0}, 0.5, 0.5),
     "no rest at the start": ({"rest_frames": 0}, 0.15, 0.2),
 }

@@ -81,16 +81,13 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
 
     grey, (across, down) = eight_bits(picture), board.squares
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    for enlarge in (1, 2):
-        for columns, rows in dict.fromkeys([(across, down), (down, across)]):
-            # The sector-based detector (Duda & Frese 2018)
-            shape = (columns - 1, rows - 1)
-            seen, found_px = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), shape, flags=flags)
-            if not seen:
-                continue
-            found_px = _in_original(found_px.reshape(-1, 2), enlarge)
+    for columns, rows in dict.fromkeys([(across, down), (down, across)]):
+        # The sector-based detector (Duda & Frese 2018)
+        seen, found_px = cv2.findChessboardCornersSB(grey, (columns - 1, rows - 1), flags=flags)
+        if seen:
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
-            return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
+            grid_m = grid.astype(float) * (board.square_mm / 1000)
+            return _enough(found_px.reshape(-1, 2).astype(float), grid_m, "all are seen")
     raise _not_as_stated(picture, f"no checkerboard of {across} × {down} squares is seen")
 
 
