@@ -342,7 +342,6 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     from vinetrack.figures.style import write_figure
     from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
 
-    options["effects"] += options.pop("named")
     power = power_of_target(PowerRequest(target=target, **options))
     lines = [*str(power).splitlines(), *write_figure(figure, power.plot)]
     if rows_file is not None and (rows := sheet_rows(power)):

@@ -135,15 +135,14 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
 def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
     """Shapes of an effect at finite sizes within its plausible range."""
     size = effect.parameters[0]
+    fractions: tuple[float, ...] = (0.03, 0.2, 0.7)  # of the largest plausible size (chosen)
     low, high = plausible_range(size)
-    # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
-    # infinitesimal size (chosen)
-    with_threshold = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
-    has_threshold = "rest_force" in effect.functions
-    largest = high if abs(high) >= abs(low) else low
-    steps = [fraction * (largest - size.zero) for fraction in (with_threshold if has_threshold else (0.03, 0.2, 0.7))]
-    if _spans_decades(size) and not has_threshold:
-        steps = [value - size.zero for value in _typical_values(size)]
+    largest = (high if abs(high) >= abs(low) else low) - size.zero
+    if "rest_force" in effect.functions:  # no response to a size below a threshold
+        fractions = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)  # (chosen)
+    elif _spans_decades(size):
+        fractions = tuple((value - size.zero) / largest for value in _typical_values(size))
+    steps = [fraction * largest for fraction in fractions]
     return [CandidateShape(effect, values, step, whole=True) for values in other_values for step in steps]
 
 
@@ -292,8 +291,8 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 class Products:
     """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the fit's
     noise, shape (n_trials, n_columns, n_columns); the residual is taken with the trial effects at their prior means.
-    `problem` is that of the fit with the systematic errors as further
-    parameters; `silent` names the effects to which no trajectory responds at any plausible size.
+    `problem` is that of the fit with the systematic errors as further parameters; `silent` names the effects to which
+    no trajectory responds at any plausible size.
     """
 
     white: Floats
