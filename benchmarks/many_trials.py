@@ -102,7 +102,7 @@ def show(what: str, used: Run, results: Path | None = None, tracked: int = 0, ve
     print(f"{what:38s}{cells}  {verdict}", flush=True)
     before, steps = 0.0, []
     for line, at_s in used.steps.items():
-        if line.startswith(("trials analysed", "damping law", "model fitted", "figures of", "clips", "report written")):
+        if line.startswith(("trials: ", "model: ", "report: ")):
             steps.append(f"{line} {at_s - before:.1f} s")
             before = at_s
     if steps:

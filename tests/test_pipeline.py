@@ -17,6 +17,7 @@ from commanded import run, succeed
 from lsoda_vine import grown_position, vine_trial
 
 import vinetrack
+from vinetrack.cli import commands
 from vinetrack.pipeline.stages import STAGES
 
 ROOT = Path(__file__).parents[1]
@@ -233,6 +234,9 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     assert json.loads((results / "fit.json").read_text())["refused"].startswith("No trial can be fitted")
     assert {name: (results / name).read_text() for name in MODEL_HEADERS} == MODEL_HEADERS  # and no rows
     assert not list((results / "comparison").iterdir())
+    lines, failed = commands._run_lines(results)
+    assert failed
+    assert lines[-1].startswith("error: 3 of 3 trials failed, a first")
 
 
 # A workflow that is killed goes on with the same command.
@@ -251,6 +255,15 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path):
             time.sleep(0.05)
         first.kill()
     assert not (results / "trials.csv").exists()
-    again = subprocess.run(command, capture_output=True, text=True, check=False, **where)
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert (results / "trials.csv").exists()
+
+    def again() -> int:
+        return subprocess.run(command, capture_output=True, check=False, **where).returncode
+
+    assert again() == 0
+    analysed = {path: path.read_bytes() for path in (results / "analysed").glob("*.json")}
+    # Earlier results stay where a job fails: here no file can be written in a folder that is a file.
+    shutil.rmtree(results / "kinematics")
+    (results / "kinematics").touch()
+    (tmp_path / "vines" / "trials.csv").touch()
+    assert again() == 1
+    assert {path: path.read_bytes() for path in (results / "analysed").glob("*.json")} == analysed != {}

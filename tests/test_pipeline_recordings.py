@@ -170,6 +170,23 @@ def test_check_says_of_the_same_folder_what_is_wrong(filmed):
     assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
 
 
+def test_a_sheet_that_contradicts_its_films_comes_before_the_verdict(filmed, tmp_path):
+    """A tube that is 12 mm wide in the pictures, and 14 mm in the sheet of another folder."""
+    films, folder, results = filmed.results.parents[1] / "vines", tmp_path / "wide", tmp_path / "out" / "wide"
+    folder.mkdir()
+    for name in ("videos", "calibration"):
+        (folder / name).symlink_to(films / name)
+    write_sheet(folder, GOOD, BOARD + FEW)
+    (folder / "trials.csv").write_text((folder / "trials.csv").read_text().replace(",12,", ",14,"))
+    shutil.copytree(filmed.results / ".kept", results / ".kept")
+    lines = succeed("run", folder, "--results", tmp_path / "out").splitlines()
+    diagnosis = json.loads((results / "diagnosis.json").read_text())
+    assert diagnosis["contradicted_columns"] == ["diameter_mm"]
+    assert diagnosis["next_experiment"] is None
+    assert "diameter_mm" in lines[-1]
+    assert run("propose", results).exit_code == 1
+
+
 def test_a_scale_that_is_given_serves_as_well(tmp_path):
     """Through a camera without distortion or tilt, for scales that know of neither."""
     folder = tmp_path / "vine"

@@ -353,5 +353,6 @@ MISSING_OR_WRONG = (
 def test_what_is_missing_or_wrong_is_refused_with_an_exit_code(arguments):
     done = run(*arguments)
     assert done.exit_code == (2 if {"loose", "a.doc"} & {*arguments} else 1)
+    assert done.exit_code == 2 or done.output.startswith("error: ")
     assert "Traceback" not in done.output
     assert "internal error of the program" not in done.output

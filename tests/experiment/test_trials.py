@@ -251,7 +251,7 @@ def test_every_unit_of_every_column_is_read(tmp_path, column, place):
 
 
 def test_keys_of_groups_and_ranges_are_converted(tmp_path):
-    text = "limits: {pressure_psi: '1:5', diameter_in: [1, 2], hoop_stress_kPa: 7000}\nambient_pressure_bar: 1\n"
+    text = "limits: {pressure_psi: '1:5', diameter_in: [1, 2], hoop_stress_kPa: '7000,0'}\nambient_pressure_bar: 1,0\n"
     settings = one(tmp_path, text + "axis: {from_px: [1, 2], to_px: [9, 90], width_cm: 2}\n").settings
     assert settings.limits.pressure_kPa == pytest.approx((6.894757, 34.473786))
     assert (settings.limits.diameter_mm, settings.limits.hoop_stress_MPa) == ((25.4, 50.8), 7)

@@ -204,6 +204,16 @@ def test_the_marks_of_a_ruler_are_proposed_and_how_the_camera_was_turned_is_aske
     apart_px = np.hypot(*np.subtract(settings.calibration.to_px, settings.calibration.from_px))
     assert settings.calibration.length_mm / apart_px == pytest.approx(1 / 3.0, rel=1e-3)
     assert settings.growth_angle_deg == 0
+    # Twice the length contradicts both recordings, which is one thing; after reloading the photo is still there.
+    person.chrome.run("(s => { s.focus(); s.select(); })(document.querySelector('#spacing'))")
+    person.chrome.send("Input.insertText", text="2")
+    person.press("#check")
+    person.said("#headline", "1 thing ")
+    person.chrome.open(person.chrome.run("location.href"))
+    person.chrome.wait("document.body.dataset.ready === 'yes'", "the page again", 120)
+    person.press("input[name=tool][value=scale]")
+    person.chrome.wait("document.querySelector('#source').value === 'IMG_1.png'", "the photo of the ruler")
+    person.said("#scale-facts", "px apart")
 
 
 def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person, clips):

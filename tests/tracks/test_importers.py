@@ -44,6 +44,18 @@ def test_a_table_of_positions_and_what_comes_along(tmp_path, encoding, separator
     assert track.usable.all()
 
 
+def test_a_track_of_a_results_folder_keeps_its_errors_and_flags(tmp_path):
+    header = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag,lead_position_systematic_m,pressure_Pa\n"
+    flags = ["before_release;doubtful", "", "", "", "", "", "", "after_end"]
+    lines = [f"{k},{t},{9 * k},{y},2e-5,{flag},3e-5,NaN" for k, (t, y, flag) in enumerate(zip(TIMES, POSITIONS, flags))]
+    track = read_track(write(tmp_path, header + "\n".join(lines)))
+    np.testing.assert_array_equal(track.lead_position_m, POSITIONS)
+    assert track.flag.tolist() == flags
+    assert {*track.lead_position_sigma_m, *track.lead_position_systematic_m} == {2e-5, 3e-5}
+    assert track.pressure_Pa is None
+    assert len(track.notes) == 1
+
+
 def test_frames_before_those_chosen_are_no_outliers(tmp_path):
     track = read_track(write(tmp_path, "time_s,position_m\n" + rows(TIMES, POSITIONS)), frames_used=(2, 6))
     assert track.usable.tolist() == [False, False, True, True, True, True, True, False]

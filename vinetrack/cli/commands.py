@@ -79,8 +79,8 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
 
 def _run_lines(folder: Path) -> tuple[list[str], bool]:
     """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last,
-    or why there is none; and whether most trials failed. They are kept, since reading a diagnosis takes most of a
-    second.
+    or why there is none and what to do; and whether most trials failed or there is no verdict. They are kept, since
+    reading a diagnosis takes most of a second.
     """
     from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
 
@@ -91,16 +91,17 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
         from vinetrack.narrative.verdict_text import verdict_line, verdict_table
 
         trials, diagnosis = read_result(results.trials), read_diagnosis(results)
-        told, most = failures_told(trials)
-        lines = [f"Report: {results.report}"] if most or not told else [told, f"Report: {results.report}"]
+        told, failed = failures_told(trials)
+        lines = [f"Report: {results.report}"] if failed or not told else [told, f"Report: {results.report}"]
         if diagnosis is not None and diagnosis.verdict:
             lines += table_lines(diagnosis, in_short=True)
             notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
             then = verdict_table(diagnosis)[0].note
             lines += [*notes, f"{verdict_line(diagnosis)}{f'. {then}' if then else ''}"]
-        elif diagnosis is not None and not most:
-            lines.append(diagnosis.explanation)
-        return [*lines, told] if most else lines, most
+        elif diagnosis is not None and not failed:
+            told, failed = diagnosis.explanation, True
+        then = "The report gives the reason of every trial: mend that of the first, and run again."
+        return [*lines, f"error: {told.rstrip('.')}. {then}"] if failed else lines, failed
 
     state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
     return Kept(folder).made("lines", state, summary)
@@ -354,7 +355,7 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
 # One command for each stage, and the order of all of them in the help.
 
 
-def _stage_command(stage: Stage) -> Callable[..., None]:
+def _stage_command(name: str, stage: Stage) -> Callable[..., None]:
     @command("stage")
     def run_stage(
         experiment: Path, results: Path, trials: list[str] | None, settings: dict[str, Any], threads: int, report: Say
@@ -364,13 +365,13 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         from vinetrack.pipeline.workflow import RUN, find_experiment
 
         read = read_experiment(find_experiment(experiment))
-        if unknown := [name for name in trials or () if name not in read.names]:
+        if unknown := [one for one in trials or () if one not in read.names]:
             raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
         in_run = RUN in os.environ
         say = typer.echo if in_run else report
         say(stage.does.rstrip("."))
         lines = stage.run(Job(read, results, run_settings(settings), trials or None, threads, say))
-        return [stage.done] if in_run else lines, None
+        return [f"{name}: {lines[0]}"] if in_run else lines, None
 
     run_stage.__doc__ = stage.does
     return run_stage
@@ -397,4 +398,4 @@ def register(app: typer.Typer) -> None:
             group.command(one.__name__.removeprefix("_"), rich_help_panel=panel)(one)
     app.add_typer(design, rich_help_panel=MORE)
     for name, stage in STAGES.items():
-        app.command(name, rich_help_panel="Stages of the workflow")(_stage_command(stage))
+        app.command(name, rich_help_panel="Stages of the workflow")(_stage_command(name, stage))

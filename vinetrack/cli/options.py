@@ -57,25 +57,23 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
     except (typer.Exit, typer.BadParameter, typer.Abort):
         raise
     except ExperimentError as error:
-        _exit_with("\n".join(format_problems(error.problems)))
+        _exit_with("\n".join(format_problems(error.problems)), "")
     except KeyboardInterrupt:
-        _exit_with("Stopped; finished results are kept.")
+        _exit_with("Stopped; finished results are kept.", "")
     except BrokenPipeError:
         # The reader (such as `| head`) has closed the pipe; redirect it, or Python reports the error again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except Exception as error:
         if is_disk_full(error):
-            _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
+            _exit_with("the disk is full: free some space and run the same command again; finished results are kept.")
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, OSError) and error.strerror and (place := error.filename2 or error.filename):
             _exit_with(f"{place}: {error.strerror[:1].lower()}{error.strerror[1:]}: name another file or folder.")
         if isinstance(error, UserError):
             _exit_with(str(error))
         place = f"; the traceback is in {log}" if log else "; run it again with --log FILE for the traceback"
-        _exit_with(
-            f"An internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}."
-        )
+        _exit_with(f"internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}")
 
 
 def _print_line(line: str, err: bool = False) -> None:
@@ -84,8 +82,8 @@ def _print_line(line: str, err: bool = False) -> None:
     typer.secho(line, fg=None if os.environ.get("NO_COLOR") else colour, err=err)
 
 
-def _exit_with(message: str) -> None:
-    for line in message.splitlines():
+def _exit_with(message: str, severity: str = "error: ") -> None:
+    for line in f"{severity}{message}".splitlines():
         _print_line(line, err=True)
     raise typer.Exit(1)
 

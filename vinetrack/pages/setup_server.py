@@ -252,8 +252,7 @@ def page_state(folder: Path) -> dict[str, Any]:
     content = parse_yaml(draft.settings, SETTINGS).content
     sheet = draft.sheet
     # Columns that the page shows whether or not the sheet has them
-    optional = ["payload_g", "growth_angle_deg", "film_density_kg_m3", "chamber_l", "inlet_mm", "exposure_us"]
-    optional += ["pressure_trace"]
+    optional = ["payload_g", "growth_angle_deg", "film_density_kg_m3", "chamber_l", "inlet_mm", "pressure_trace"]
     known = {}
     for name in [name for name in COLUMNS if name not in ("trial", "video")]:
         units = [split_unit(name)[1], *other_units(name).values()]
@@ -266,7 +265,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         "stamp": draft.stamp,
         "known": known,
         "units": {key: unit.text for key, unit in UNITS.items()},
-        "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
+        "offered": ["capture_fps", "exposure_us", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
         "kept": list(present.columns) if present.rows else ["trial", "video", "track"],
         "unsaved": not (

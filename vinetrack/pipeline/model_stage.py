@@ -72,7 +72,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     job.say("fitting the damping law under every model")
     write_diagnosis(results, diagnosis, lambda: motions, job.settings)
-    return [*lines, str(diagnosis)]
+    return ["fitted and diagnosed" if diagnosis.verdict else "no diagnosis", *lines, str(diagnosis)]
 
 
 def fit_model(job: Job) -> tuple[Fit | None, Pairs, list[TrialMotion]]:

@@ -56,7 +56,7 @@ def write_report(job: Job) -> list[str]:
     page = build_report(report_content(experiment, job.results, provenance))
     write_json(results.provenance, provenance)
     write_text(results.report, page)
-    return [*lines, f"Report: {results.report}"]
+    return ["written", *lines, f"Report: {results.report}"]
 
 
 # ------------------------------------------------------------------------------

@@ -51,7 +51,7 @@ class Job:
 class Stage:
     """One stage: what it does in words, and by which function, `module:name`, of a job. `settings` are the keys of a
     run that it depends on; `reads` and `writes` are files of the results, or groups of files that the plan of a run
-    knows, in `<…>`; a folder ends with `/`. `done` says that it is.
+    knows, in `<…>`.
     """
 
     does: str
@@ -59,11 +59,10 @@ class Stage:
     settings: tuple[str, ...]
     reads: tuple[str, ...]
     writes: tuple[str, ...]
-    done: str
     parallel: bool = False
 
     def run(self, job: Job) -> list[str]:
-        """Do the job; return lines for the terminal."""
+        """Do the job; return lines for the terminal, the first of which says what was done."""
         module, name = self.function.split(":")
         with compilation_told(job.say):
             lines: list[str] = getattr(import_module(f"vinetrack.pipeline.{module}"), name)(job)
@@ -77,7 +76,6 @@ STAGES = {
         ("steady", "velocity", "final_at_fraction", "efficiency_at_mm", "figures"),
         ("<measurements>",),
         ("<trials>",),
-        "trials analysed",
         parallel=True,
     ),
     "model": Stage(
@@ -86,8 +84,7 @@ STAGES = {
         ("steady", "velocity", "damping", "final_at_fraction", "efficiency_at_mm"),
         ("<trials>",),
         ("trials.csv", "conditions.csv", "steady.csv", "damping_points.csv", "damping.json", "scaling.json", "fit.json",
-         "comparison.csv", "model_check.csv", "audit.csv", "comparison/", "diagnosis.json", "ladder.csv", "diagnosis/"),
-        "model fitted and diagnosed",
+         "comparison.csv", "model_check.csv", "audit.csv", "diagnosis.json", "ladder.csv"),
     ),
     "report": Stage(
         "Draw the figures of the experiment and clips of its recordings, and write the report, a single file.",
@@ -95,7 +92,6 @@ STAGES = {
         (),
         ("diagnosis.json",),
         ("report.html", "provenance.json"),  # which figures have content is not known in advance
-        "report written",
         parallel=True,
     ),
 }  # fmt: skip
@@ -164,9 +160,8 @@ def _end_with_parent() -> None:
 # ------------------------------------------------------------------------------
 # What a run need not make twice: the check, tracks in pixels, figures of trials; kept in the results by their inputs.
 #
-# Snakemake deletes the outputs of a job before it runs it again; what is kept lies beside them, in a folder that it
-# does not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a
-# month is dropped.
+# It lies beside the results, in a folder that Snakemake does not know. A file that is replaced, or another version of
+# the program, has another key; what no run asks for in a month is dropped.
 
 
 @lru_cache(maxsize=2)

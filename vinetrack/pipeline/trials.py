@@ -61,7 +61,7 @@ log = logging.getLogger(__name__)
 
 
 def analyse_trials(job: Job) -> list[str]:
-    """Analyse all trials in use, or some, and write their files; empty ones of faulty rows. Returns what failed."""
+    """Analyse all trials in use, or some, and write their files; empty ones of faulty rows. Tells what failed."""
     experiment, only = job.experiment, job.trials
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
@@ -76,7 +76,8 @@ def analyse_trials(job: Job) -> list[str]:
             log.error("trial %s:\n%s", name, fault)
         job.say(f"{count} of {len(names)} trials")
     Kept(job.results).forget()
-    return [f"  {name}: {reasons[name]}" for name in names if reasons[name]][:10]
+    failed = [f"  {name}: {reasons[name]}" for name in names if reasons[name]]
+    return [f"{len(names) - len(failed)} of {len(names)} analysed", *failed[:10]]
 
 
 def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:

@@ -368,17 +368,17 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         waiting("starting") as bar,
     ):
         assert process.stdout is not None
-        told = {COMPILING, *(stage.done for stage in STAGES.values())}
+        told = {COMPILING}
         for line in map(str.rstrip, process.stdout):
             if match := re.fullmatch(r"(\d+) of (\d+) (\w+)", line):  # what a stage says while it works
                 bar.update(bar.task_ids[0], completed=int(match[1]), total=int(match[2]), description=match[3])
-            elif line in told:
+            elif line in told or line.partition(":")[0] in STAGES:  # what a stage has done
                 say(line)
-                told -= {COMPILING}
+                told.discard(line)
             else:
                 bar.remove_task(bar.task_ids[0])
                 bar.add_task(line, total=None)
     if process.returncode:
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
-        raise UserError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
+        raise UserError("\n".join([f"the run stopped; the logs of its stages are in {log.parent}", *explanation]))

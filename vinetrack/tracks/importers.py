@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import InputError
-from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
 from vinetrack.core.terminal import table
 from vinetrack.core.units import UNITS, number, split_unit
@@ -375,7 +375,8 @@ def table_track(text: str, wanted: str, capture_fps: float, m_per_px: float) -> 
     notes += [rounded, projected]
     if missing := int(np.sum(~np.isfinite(position_m))):
         notes.append(f"{missing} rows have no position.")
-    sigma_m, pressure_Pa = (_beside(table, quantity, si)[rows] for quantity, si in (("sigma", "m"), ("pressure", "Pa")))
+    known = {"sigma": "m", "systematic": "m", "pressure": "Pa"}
+    sigma_m, systematic_m, pressure_Pa = (_beside(table, quantity, si)[rows] for quantity, si in known.items())
     if np.any(sigma_m < 0):
         raise InputError(f"line {table.lines[rows[np.argmax(sigma_m < 0)]]}, column sigma is negative", "correct it")
     if np.any(sigma_m == 0):
@@ -385,14 +386,18 @@ def table_track(text: str, wanted: str, capture_fps: float, m_per_px: float) -> 
     if traced.any() and not traced.all():
         notes.append(f"Pressure is interpolated at {int(np.sum(~traced))} points where its cell is blank.")
     trace_Pa = np.interp(time_s, time_s[traced], pressure_Pa[traced]) if traced.any() else None
-    sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
-    return new_track(time_s, position_m, list(filter(None, notes)), lead_position_sigma_m=sigma_m, pressure_Pa=trace_Pa)
+    more: dict[str, Any] = {"lead_position_sigma_m": np.where(sigma_m == 0, np.nan, sigma_m), "pressure_Pa": trace_Pa}
+    if np.isfinite(systematic_m).any():  # a track of vinetrack itself
+        more["lead_position_systematic_m"] = systematic_m
+        more["flag"] = np.array([join_flags(table.rows[row].get("flag", "")) for row in rows])
+        notes.append("Read as a track of vinetrack, with its errors and flags.")
+    return new_track(time_s, position_m, list(filter(None, notes)), **more)
 
 
 def _beside(table: Table, quantity: str, si: str) -> Floats:
     """A column of another quantity in SI, such as `pressure_psi`; NaN where there is none. Shape (n_rows,)."""
     for name in table.columns:
-        if (split := split_unit(name))[0] == quantity:
+        if (split := split_unit(name.removeprefix("lead_position_")))[0] == quantity:
             return table.numbers(name, blank_is_nan=True) * _factor(split[1], si)
     return np.full(len(table.rows), np.nan)
 
