@@ -47,7 +47,8 @@ def test_a_table_of_positions_and_what_comes_along(tmp_path, encoding, separator
 def test_a_track_of_a_results_folder_keeps_its_errors_and_flags(tmp_path):
     header = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag,lead_position_systematic_m,pressure_Pa\n"
     flags = ["before_release;doubtful", "", "", "", "", "", "", "after_end"]
-    lines = [f"{k},{t},{9 * k},{y},2e-5,{flag},3e-5,NaN" for k, (t, y, flag) in enumerate(zip(TIMES, POSITIONS, flags))]
+    seen = zip(TIMES, POSITIONS, flags, strict=True)
+    lines = [f"{k},{t},{9 * k},{y},2e-5,{flag},3e-5,NaN" for k, (t, y, flag) in enumerate(seen)]
     track = read_track(write(tmp_path, header + "\n".join(lines)))
     np.testing.assert_array_equal(track.lead_position_m, POSITIONS)
     assert track.flag.tolist() == flags

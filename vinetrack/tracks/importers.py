@@ -375,8 +375,8 @@ def table_track(text: str, wanted: str, capture_fps: float, m_per_px: float) -> 
     notes += [rounded, projected]
     if missing := int(np.sum(~np.isfinite(position_m))):
         notes.append(f"{missing} rows have no position.")
-    known = {"sigma": "m", "systematic": "m", "pressure": "Pa"}
-    sigma_m, systematic_m, pressure_Pa = (_beside(table, quantity, si)[rows] for quantity, si in known.items())
+    beside = (("sigma", "m"), ("systematic", "m"), ("pressure", "Pa"))
+    sigma_m, systematic_m, pressure_Pa = (_beside(table, quantity, si)[rows] for quantity, si in beside)
     if np.any(sigma_m < 0):
         raise InputError(f"line {table.lines[rows[np.argmax(sigma_m < 0)]]}, column sigma is negative", "correct it")
     if np.any(sigma_m == 0):
