@@ -209,6 +209,7 @@ def test_the_marks_of_a_ruler_are_proposed_and_how_the_camera_was_turned_is_aske
     person.chrome.send("Input.insertText", text="2")
     person.press("#check")
     person.said("#headline", "1 thing ")
+    person.save()
     person.chrome.open(person.chrome.run("location.href"))
     person.chrome.wait("document.body.dataset.ready === 'yes'", "the page again", 120)
     person.press("input[name=tool][value=scale]")
