@@ -12,7 +12,7 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
-from commanded import fit_law, run, succeed
+from commanded import run, succeed
 from test_pipeline import read_rows, snakemake
 
 from vinetrack.experiment.folder import read_experiment
@@ -185,25 +185,6 @@ def test_a_sheet_that_contradicts_its_films_comes_before_the_verdict(filmed, tmp
     assert diagnosis["next_experiment"] is None
     assert "diameter_mm" in lines[-1]
     assert run("propose", results).exit_code == 1
-
-
-def test_a_scale_that_is_given_serves_as_well(tmp_path):
-    """Through a camera without distortion or tilt, for scales that know of neither."""
-    folder = tmp_path / "vine"
-    truth = film_all(folder, {"p36": 36}, PLAIN)["p36"]
-    two_points = "{kind: two_points, from_px: [100, 60], to_px: [600, 60], length_mm: 120}"
-    for settings, rel_sigma in (
-        (f"calibration: {two_points}\n", 0.5 * 2**0.5 / 500),
-        ("calibration: {kind: mm_per_px, mm_per_px: 0.24}\n", np.nan),
-        ("mm_per_px: 0.24\n", np.nan),
-    ):
-        write_sheet(folder, {"p36": 36}, settings)
-        succeed("trials", folder, tmp_path)
-        fit_law(folder, tmp_path)
-        row = read_rows(tmp_path / "trials.csv")["p36"]
-        assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
-        assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
-        assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
 
 
 @pytest.mark.real

@@ -79,7 +79,7 @@ def test_provenance_says_what_could_not_be_read_and_a_full_disk_is_said_as_such(
     monkeypatch.setattr(Path, "write_bytes", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     done = run("trials", vines, tmp_path / "out")
     assert done.exit_code == 1
-    assert done.output.startswith("The disk is full: ")
+    assert done.output.startswith("error: the disk is full: ")
 
 
 PLACES = {

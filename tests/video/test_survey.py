@@ -1,6 +1,5 @@
 """Checks of recordings, scales and sizes before any work."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,12 +11,8 @@ from plain_scene import write_video
 
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.experiment.folder import check_experiment, read_experiment
-from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import Tube, preset
-from vinetrack.pipeline.stages import Job
-from vinetrack.pipeline.trials import analyse_trials
-from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video import survey as module
 from vinetrack.video.axis import askew_trials
 from vinetrack.video.frames import RecordingError, inspect_recording
@@ -229,15 +224,3 @@ def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
 def test_check_catches_a_mistake(clip, tmp_path, row, settings, expected):
     (tmp_path / "a.mp4").symlink_to(clip)
     assert check(tmp_path, "a.mp4", settings=settings, row=row) == expected
-
-
-@pytest.mark.slow
-def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip, tmp_path):
-    shutil.copy(clip, tmp_path / "a.mp4")
-    noted = []
-    for scale in (SCALE_MM, 0.8 * SCALE_MM):
-        check(tmp_path, "a.mp4", settings=FILMED, header=f"{HEADER},mm_per_px", row=f"{RIGHT},{scale}")
-        analyse_trials(Job(read_experiment(tmp_path), tmp_path / "out", run_settings({})))
-        noted.append(read_json(Results(tmp_path / "out").analysed("t0")))
-    assert noted[1]["row"]["status"] == "warning"
-    assert [[entry["column"] for entry in trial["contradictions"]] for trial in noted] == [[], ["diameter_mm"]]

@@ -204,8 +204,6 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
         return math.nan if given is None else given / float(line["per"] or 1)
     if kind == "texts":
         return tuple(given or ())
-    if kind == "choice" and given not in (None, *line["metavar"].split("|")):
-        raise _refused(line, f"{given!r} is neither {line['metavar'].replace('|', ' nor ')}")
     if kind == "picture" and given is not None and given.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise _refused(line, f"'{given}' is not the name of a picture: end it in .png, .svg or .pdf")
     if kind == "column" and given is not None:

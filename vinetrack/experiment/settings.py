@@ -29,10 +29,8 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT
 
 InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
 NoTruth = BeforeValidator(lambda value: str(value) if isinstance(value, bool) else value)  # yes and no are no 1 and 0
-# Text is read like a cell of the sheet: with a decimal comma, too
-Number = Annotated[
-    float, BeforeValidator(lambda value: parse_number(value) if isinstance(value, str) else value), NoTruth
-]
+# Text is read like a cell of the sheet
+Number = Annotated[float, BeforeValidator(lambda v: parse_number(str(v)) if isinstance(v, str | bool) else v)]
 Count = Annotated[int, NoTruth]
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]

@@ -112,8 +112,7 @@ class PredictionBasis:
 
 def read_basis(
     needed: Sequence[str] = REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
-    results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), tail_slack: str | None = None,
-    **numbers: Any,
+    results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), **numbers: Any,
 ) -> PredictionBasis:  # fmt: skip
     """Read the sheet or the options, the fit, and the requested effects. `cells` are texts by column of the sheet, for
     the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
@@ -132,8 +131,6 @@ def read_basis(
         said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
         if cells:
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
-    if tail_slack is not None:
-        planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
     user_effects = planned.user_effects
     if fit is not None and not set(fit.fit.names) <= set(catalogue()):
         folder = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
