@@ -208,7 +208,7 @@ def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_
 def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentence(tmp_path):
     still = write_video(tmp_path / "still.mp4", np.full((40, 160, 640), 90, np.uint8))
     done = run("track", still, "--out", tmp_path / "out")
-    assert (done.exit_code, done.stderr.strip()) == (1, f"still.mp4: nothing moves in the picture; {NO_GROWTH}")
+    assert (done.exit_code, done.stderr.strip()) == (1, f"error: still.mp4: nothing moves in the picture; {NO_GROWTH}")
     assert not (tmp_path / "out").exists()
     assert run("track", still, "--axis", "10,20").exit_code == 2
 
