@@ -39,7 +39,7 @@ BUDGETS = {
     "narrative": (1048, 3, 8),
     "pages": (2815, 7, 22),
     "paper": (891, 4, 35),
-    "pipeline": (1990, 7, 6),
+    "pipeline": (1982, 7, 6),
     "planning": (1583, 4, 24),
     "report": (746, 3, 4),
     "results": (475, 4, 9),
