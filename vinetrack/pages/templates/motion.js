@@ -18,10 +18,9 @@ export async function track(again = false) {
   corrected = false;
   $("track").disabled = true;
   if (!again) $("tracked").replaceChildren(el("p", {class: "busy"}, `Tracking ${name} …`));
-  const begun = performance.now();
   try {
     const made = await ask("api/track", content({row: state.chosen}));
-    if (mine === turn) show({...made, name, seconds: (performance.now() - begun) / 1000});
+    if (mine === turn) show({...made, name});
     if (mine === turn && again) point(shownFrame());
   } catch (error) {
     if (mine === turn) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problemsOf(error))));
@@ -38,7 +37,6 @@ function show(made) {
   const byHand = count(made.flag, (flag) => flag.includes("corrected"));
   if (byHand) facts.push(`${byHand} corrected by hand`);
   if (made.scaled) facts.push(`growth ${decimals(made.growth_mm, 4)} mm`, `tube ${decimals(made.tube_width_mm, 3)} mm wide`);
-  facts.push(`tracked in ${made.seconds.toFixed(1)} s`);
   const notes = [...made.notes];
   if (!made.timed) notes.unshift("Times are in frames: fill in capture_fps.");
   if (!made.scaled) notes.unshift("Positions are in pixels: give a scale.");

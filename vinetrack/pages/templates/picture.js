@@ -50,7 +50,7 @@ function showPicture(name) {
 
 const imageOf = (frame) => (view.source ? url("api/picture", {picture: view.source}) : url("api/frame", {recording: row().video, frame}));
 
-const showNumber = () => { [$("frame").value, $("frame-at").textContent] = [view.frame, `${view.frame} of ${state.clip.frames - 1}`]; };
+const showNumber = () => { [$("frame").value, $("frame-at").textContent] = [view.frame, view.source ? "" : `${view.frame} of ${state.clip.frames - 1}`]; };
 
 export function showFrame(frame, edge = null) {
   view.frame = Math.max(0, Math.min(state.clip.frames - 1, frame));

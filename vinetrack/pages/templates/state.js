@@ -22,12 +22,7 @@ export async function ask(path, body) {
   const options = body === undefined ? {} : {
     method: "POST", body: JSON.stringify(body), headers: {"Content-Type": "application/json", "X-Vinetrack": "setup"},
   };
-  let answer;
-  try {
-    answer = await fetch(path, options);
-  } catch {
-    throw new Error("The program has ended: start vinetrack setup again; nothing here is saved.");
-  }
+  const answer = await fetch(path, options).catch(() => { throw new Error("The program has ended: start vinetrack setup again; nothing here is saved."); });
   const content = await answer.json().catch(() => ({}));
   if (!answer.ok) throw Object.assign(new Error(content.words || `The server returned status ${answer.status}.`), {content});
   return content;
