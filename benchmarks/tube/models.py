@@ -12,7 +12,7 @@ import numpy as np
 import vinetrack as vt
 from tube.recordings import AREA_M2, Recording
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.ladder import in_sample, left_out
+from vinetrack.diagnosis.ladder import align_trials, left_out_error
 from vinetrack.diagnosis.ladder import rms_of as rms_m
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.experiment.folder import Experiment
@@ -115,8 +115,7 @@ def fit_tubes(name: str, model: Model, experiment: Experiment, recordings: Seque
         fits[tube] = fit
         trials += predicted
         if len(members) > 1:
-            squares = [float(np.mean(one.residual_m**2)) for one in left_out(fit).trials]
-            left_m[tube] = math.sqrt(float(np.mean(squares))) if squares else math.nan
+            left_m[tube] = left_out_error(fit)
     every = math.sqrt(float(np.mean(np.square(list(left_m.values()))))) if left_m else math.nan
     return Outcome(name, fits, tuple(trials), every, left_m)
 
@@ -135,12 +134,7 @@ def _best(
     for start in starts(model, [one for one in recordings if one.name in vines], vines):
         try:
             fit = vt.fit(model, pairs, shared=shared, start=start)
-            predicted = in_sample(fit).trials
-            # A trial that the fit cannot be integrated through would make it look better than one that can.
-            if len(predicted) < len(pairs):
-                print(f"{name}, {', '.join(vines)}: a start was given up. Its fit cannot be followed to the end.")
-                continue
-            followed.append((fit, predicted))
+            followed.append((fit, tuple(align_trials(fit).trials)))
         except vt.FitError as error:
             print(f"{name}, {', '.join(vines)}: a start was given up. {error}")
     if not followed:

@@ -21,7 +21,7 @@ from vinetrack.diagnosis.ladder import candidates_of, first_that_counts
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import optimiser, solving
-from vinetrack.inference.fit import fit_subset, predict_prepared
+from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products
 from vinetrack.inference.marginal_likelihood import FitState
@@ -404,27 +404,8 @@ def test_what_nothing_moves_or_has_no_mass_and_unknown_parameters_are_refused():
             vt.fit(vt.base_model(), given, fixed=fixed)
 
 
-def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campaign):
-    whole, pairs, _ = campaign
-    rest = [pair for pair in pairs if pair[0].condition != pairs[0][0].condition]
-    warm = fit_subset(whole, [trial.condition != pairs[0][0].condition for trial, _ in pairs])
-    spreads = tuple(whole.spreads[name].value for name in ("pressure", "B"))
-    cold = vt.fit(vt.base_model(), rest, spreads=spreads)
-    assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
-    for one, other in zip(warm.numbers, cold.numbers, strict=True):
-        assert one.name == other.name
-        assert abs(one.value - other.value) < 0.1 * other.sigma
-        assert one.sigma == pytest.approx(other.sigma, rel=0.05)
-    assert tuple(warm.spreads[name].value for name in ("pressure", "B")) == spreads
-    assert warm.noise_correlation == whole.noise_correlation
-    # The parameters of a vine that is left out are dropped.
-    stays = pairs[0][0].vine
-    alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
-    assert {number.vine for number in alone.numbers} == {"", stays}
-    with pytest.raises(vt.FitError):
-        vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
-    with pytest.raises(vt.FitError):
-        fit_subset(whole, [False] * len(whole.trials))
+def test_a_refit_takes_a_model_and_no_name(campaign):
+    whole, *_ = campaign
     with pytest.raises(vt.FitError):
         vt.refit(whole, "leak")
 

@@ -148,12 +148,6 @@ class NextExperiment(JsonRecord):
     )
 
 
-def _separations(rises: Floats) -> Floats:
-    """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
-    count = np.maximum(np.isfinite(rises).sum(axis=0), 1)
-    return np.asarray(np.sqrt(np.maximum(np.nansum(rises, axis=0) / count, 0.0)))
-
-
 def _smaller(between: Floats) -> Floats:
     """The smaller separation of the two directions of every pair. Shapes: between (…, n, n) → (…, n_pairs)."""
     first, second = np.triu_indices(between.shape[-1], 1)
@@ -179,8 +173,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None) -> NextEx
     if not films:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     designs = _designs_of(tied, [extended_fit(fit, films) for fit in tied])
-    design, rises = _best_option(tied, designs, [condition for condition, _ in films], limits)
-    return _recommendation(tied, names, design, rises)
+    return _recommendation(tied, names, *_best_option(tied, designs, [condition for condition, _ in films], limits))
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -220,8 +213,8 @@ def worth(between: Floats) -> Floats:
 def _best_option(
     tied: Sequence[Fit], designs: Sequence[Designs], conditions: Sequence[Condition], limits: Limits
 ) -> tuple[list[Condition], Floats]:
-    """The best set of trials of the least effort that is sufficient, else of all. Returns design, rises (see
-    `simulated_rises`).
+    """The best set of trials of the least effort that is sufficient, else of all. Returns design, separations (see
+    `simulated_separations`).
     """
 
     def worth_of(*design: Any) -> Floats:
@@ -242,19 +235,18 @@ def _best_option(
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
             before, trials = predicted, [conditions[k] for k in design]
-            options.append((trials, simulated_rises(tied, trials, 0)))
+            options.append((trials, simulated_separations(tied, trials)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
-            if _smaller(_separations(options[-1][1][None])).min() >= 8.0:
+            if _smaller(options[-1][1]).min() >= 8.0:
                 return options[-1]
-    return max(options, key=lambda option: float(worth(_separations(option[1][None]))))
+    return max(options, key=lambda option: float(worth(option[1])))
 
 
 def _recommendation(
-    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], rises: Floats
+    fits: Sequence[Fit], names: Sequence[str], design: Sequence[Condition], between: Floats
 ) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    between = _separations(np.stack([rises, simulated_rises(fits, design, 1)]))
     expected = dict(zip(itertools.combinations(range(len(fits)), 2), _smaller(between).tolist(), strict=True))
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
@@ -298,26 +290,25 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 # wrong one can explain part of its misfit as scatter. The squared separation is the rise in the difference of −2 ln L.
 
 
-def simulated_rises(tied: Sequence[Fit], design: Sequence[Condition], draw: int) -> Floats:
-    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
-    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
-    average. Shape (n, n).
+def simulated_separations(tied: Sequence[Fit], design: Sequence[Condition]) -> Floats:
+    """Return the separation of every (true, refitted) pair; 0 where a wrong hypothesis fits better, or a refit fails.
+    The truth is at its best values and the deviations of the trials are plus or minus one standard deviation in turn,
+    so that one draw shows the average. Shape (n, n).
     """
-    n = len(tied)
     # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
-    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    rises = np.full((n, n), math.nan)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])[np.arange(len(design)) % 4]
+    rises = np.zeros((len(tied), len(tied)))
     before = np.array([-2 * fit.log_likelihood for fit in tied])
     for a, truth in enumerate(tied):
-        deviations = alternating[(np.arange(len(design)) + draw) % 4] * truth.solution.state.spread
+        deviations = alternating * truth.solution.state.spread
         try:
-            films = _noisy_films(truth, design, deviations, np.random.default_rng([0, 0, draw, a]))
+            films = _noisy_films(truth, design, deviations, np.random.default_rng([0, 0, 0, a]))
         except SimulationError:
             continue
         if films:
             after = np.array([_refitted(fit, films) for fit in tied])
             rises[a] = after - before - (after[a] - before[a])
-    return rises
+    return np.sqrt(np.maximum(np.nan_to_num(rises), 0.0))
 
 
 def _noisy_films(
@@ -353,7 +344,8 @@ def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
     try:
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
-        solution = solve(predictor, problem, state, fixed, most_iterations=most)
+        # 10.0: least decrease of the last of these steps (chosen)
+        solution = solve(predictor, problem, state, fixed, most_iterations=most, least_decrease=10.0)
         solution = solve(predictor, problem, solution.state, most_iterations=most)
         # These absorb part of what is wrong in a hypothesis, as in every fit.
         gain = with_systematics(predictor, solution).gain

@@ -2,7 +2,8 @@
 
 Each trial has its own release and origin and no other trial effect, the origin is the position at standstill, and every
 trial has the same weight. Errors differ in the data of the fit: all trials; all but the condition predicted, each in
-turn (leave-one-condition-out cross-validation); all but the highest pressure of each vine. What distinguishes
+turn (leave-one-condition-out cross-validation); all but the highest pressure of each vine. A fit without some trials is
+one Newton step away from that to all (Giordano et al., AISTATS 2019, PMLR 89, 1139). What distinguishes
 replicates so laid on a model is their scatter, the floor below which no model can fall. Two trials of a condition tell
 little about it; all of them tell by what multiple of a typical scatter of pressure and of B they differ, and the
 sensitivities of the trajectories spread it over the conditions.
@@ -12,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,8 +32,8 @@ from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.effects import Effect, catalogue, find_effect
 from vinetrack.inference.errors import root_without, trial_information
-from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, fit_subset, predict_prepared, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
+from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, rest_is_seen
+from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
@@ -160,7 +160,8 @@ LEAST_SCATTER = 0.5  # Least scatter of trials, in multiples of the typical one,
 @dataclass(frozen=True)
 class AlignedTrials:
     """A fitted model aligned with its trials: each has its own release and origin, but no deviation of pressure or B.
-    `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`; `trials` are those predicted.
+    `columns` are the sensitivities and the residual there, see `vinetrack.inference.sensitivity`; `trials` are those
+    predicted.
     """
 
     fit: Fit
@@ -205,6 +206,11 @@ class AlignedTrials:
                 dof += len(members) - 1
         return Scatter(math.sqrt(max(beyond, 0.0) / typical) if typical > 0 else 1.0, dof)
 
+    @cached_property
+    def information(self) -> tuple[Floats, Floats]:
+        """`trial_information` of the fit."""
+        return trial_information(self.fit.solution)
+
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""
         return [RELEASE] if rest_is_seen(self.predictor.data[i : i + 1])[0] else [RELEASE, ORIGIN]
@@ -213,8 +219,10 @@ class AlignedTrials:
 def align_trials(fit: Fit) -> AlignedTrials:
     """Align the model with the trials that it was fitted to, by release and origin."""
     predictor, trial_effects, trials = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
-    columns = tuple(predictor.linearise(np.empty(0), trial_effects))
-    return AlignedTrials(fit, predictor, trial_effects, columns, trials)
+    of_fit = Predictor(fit.predictor.layout, fit.predictor.data, fit.predictor.host).with_steps_of(fit.predictor)
+    sensitivities = of_fit.linearise(fit.solution.state.theta, trial_effects)
+    columns = [np.column_stack([each[:, :-1], one.residual_m]) for each, one in zip(sensitivities, trials, strict=True)]
+    return AlignedTrials(fit, predictor, trial_effects, tuple(columns), trials)
 
 
 def orthogonal_part(columns: Floats, others: Floats) -> Floats:
@@ -284,23 +292,6 @@ def mean_square(courses: Sequence[ResidualCourse], scatter: Scatter) -> tuple[fl
     total_m2 = float(np.sum(own_m2)) + smooth_m2
     degrees = 2 * total_m2**2 / (float(np.sum(variance_m4)) + 2 * smooth_m2**2 / 4)
     return total_m2 / len(courses), degrees, float(np.mean(2 * own_m2**2 / variance_m4))
-
-
-def parameter_error(aligned: AlignedTrials) -> float:
-    """Mean square by which errors of the parameters, fitted to the other conditions, move the trials of each condition,
-    m²; of trials whose parameters those determine.
-    """
-    solution = aligned.fit.solution
-    information = trial_information(solution)[0]
-    squares = []
-    for condition in aligned.courses:
-        members = [i for i, trial in enumerate(aligned.trials) if trial.trial.condition == condition]
-        if (root := root_without(solution, information, members)) is not None:
-            for i in members:
-                moved_m = design_matrix(solution.columns[i], solution.problem.index[i], len(root)) @ root
-                moved_m = orthogonal_part(moved_m, aligned.columns[i][:, aligned.nuisances(i)])
-                squares.append(np.mean(np.sum(moved_m[first_that_counts(aligned.trials[i]) :] ** 2, axis=1)))
-    return float(np.mean(squares)) if squares else 0.0
 
 
 def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter, further_m2: float = 0.0) -> dict[str, float]:
@@ -450,24 +441,6 @@ LADDER_COLUMNS = (
     *(*EXPECTED, "partial"),
 )
 
-MAX_FOLDS = 10  # Maximum number of folds of the cross-validation (chosen)
-
-# Iterations of a fit without one condition, which starts near its minimum and converges in two or three (chosen)
-MOST_ITERATIONS = 6
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Predictions of trials, and the reason for each trial that cannot be predicted, by name."""
-
-    trials: tuple[TrialFit, ...]
-    not_predicted: Mapping[str, Remark | str]
-
-    @property
-    def rms_m(self) -> float:
-        """Root mean square position error in motion, see `rms_of`."""
-        return rms_of(self.trials)
-
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
     """Compute the errors of the initial model and of every enlarged one, the last `partial` of them without a claim.
@@ -476,29 +449,29 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     """
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
-    settled = len(fits) - partial - 1
-    aligned = align_trials(fits[settled])
-    inside_m = [rms_of(aligned.trials) if k == settled else in_sample(fit).rms_m for k, fit in enumerate(fits)]
-    floor_m, courses = aligned.floor_m, list(itertools.chain(*aligned.courses.values()))
-    expected = expected_error(courses, aligned.scatter, parameter_error(aligned))
+    settled = align_trials(fits[len(fits) - partial - 1])
+    floor_m, courses = settled.floor_m, list(itertools.chain(*settled.courses.values()))
+    by_parameters_m = np.nan_to_num(root_mean(left_out(settled)[1]))
+    expected = expected_error(courses, settled.scatter, by_parameters_m**2)
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
-        outside, highest = left_out(enlarged), highest_pressure(enlarged)
+        aligned = settled if enlarged is settled.fit else align_trials(enlarged)
+        outside_m2, highest_m2 = left_out(aligned)[0], without(aligned, highest_pressures(aligned))[0]
         rows.append(
             {
                 "model": "+".join(enlarged.model.names),
                 "added": name,
-                "rms_in_sample_m": inside_m[place],
-                "rms_left_out_m": outside.rms_m,
-                "rms_highest_pressure_m": highest.rms_m,
+                "rms_in_sample_m": rms_of(aligned.trials),
+                "rms_left_out_m": root_mean(outside_m2),
+                "rms_highest_pressure_m": root_mean(highest_m2),
                 "floor_m": floor_m,
-                "excess_left_out_m": excess(outside.rms_m, floor_m),
+                "excess_left_out_m": excess(root_mean(outside_m2), floor_m),
                 **expected,
                 "partial": place >= len(fits) - partial,
             }
         )
-        for what, errors in (("conditions", outside), ("highest_pressure", highest)):
-            for reason, count in Counter(map(str, errors.not_predicted.values())).items():
-                note = remark("left_out_error_without", left_out=what, count=count, reason=reason)
+        for what, squares_m2 in (("conditions", outside_m2), ("highest_pressure", highest_m2)):
+            if count := np.count_nonzero(np.isnan(squares_m2)):
+                note = remark("left_out_error_without", left_out=what, count=count)
                 notes += [note] if note not in notes else []
     table = pd.DataFrame(rows, columns=list(LADDER_COLUMNS))
     table.attrs["notes"] = notes
@@ -510,52 +483,48 @@ def excess(rms_m: float, floor_m: float) -> float:
     return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan
 
 
-def in_sample(fit: Fit) -> Errors:
-    """Predictions of the trials that the model was fitted to."""
-    return _predicted(fit, fit.predictor.data)
+def root_mean(squares: Floats) -> float:
+    """Root of the mean of those that are known; NaN where none is."""
+    known = squares[np.isfinite(squares)]
+    return math.sqrt(np.mean(known)) if known.size else math.nan
 
 
-def left_out(fit: Fit) -> Errors:
-    """Predictions of every condition by the model fitted to all others (cross-validation). Of more than `MAX_FOLDS`
-    conditions several are left out at once, those of one vine spread over the folds.
+def left_out(aligned: AlignedTrials) -> tuple[Floats, Floats]:
+    """`without` the condition of each trial (cross-validation)."""
+    names = np.array([trial.trial.condition for trial in aligned.trials])
+    squares = np.empty((2, names.size))
+    for name in np.unique(names):
+        squares[:, names == name] = without(aligned, np.flatnonzero(names == name))
+    return squares[0], squares[1]
+
+
+def left_out_error(fit: Fit) -> float:
+    """Error of a fitted model on conditions left out, rms, m."""
+    return root_mean(left_out(align_trials(fit))[0])
+
+
+def highest_pressures(aligned: AlignedTrials) -> NDArray[np.intp]:
+    """Indices of the trials at the highest pressure of each vine."""
+    pressures_Pa = pd.Series([trial.trial.pressure_Pa for trial in aligned.trials])
+    highest_Pa = pressures_Pa.groupby([trial.trial.vine for trial in aligned.trials]).transform("max")
+    return np.flatnonzero(pressures_Pa >= highest_Pa)
+
+
+def without(aligned: AlignedTrials, gone: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Mean squares in motion, m², of the errors of some trials as the fit to all others predicts them, and of what the
+    errors of its parameters contribute; NaN where the others do not determine what these depend on. Shapes: gone (n,) →
+    (n,), (n,).
     """
-    vines = {trial.trial.condition: trial.trial.vine for trial in fit.trials}
-    conditions = sorted(vines, key=vines.__getitem__)
-    folds = [set(conditions[k::MAX_FOLDS]) for k in range(min(len(conditions), MAX_FOLDS))]
-    return _combined([_held_out(fit, [trial.trial.condition in fold for trial in fit.trials]) for fold in folds])
-
-
-def highest_pressure(fit: Fit) -> Errors:
-    """Predictions of each vine's highest pressure by the model fitted to all lower ones."""
-    highest: dict[str, float] = {}
-    for trial_fit in fit.trials:
-        trial = trial_fit.trial
-        highest[trial.vine] = max(highest.get(trial.vine, -math.inf), trial.pressure_Pa)
-    return _held_out(fit, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in fit.trials])
-
-
-def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
-    """Predictions of the trials left out (`gone`) by the model fitted to the others."""
-    data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
-    try:
-        others = fit_subset(fit, [not out for out in gone], most_iterations=MOST_ITERATIONS)
-    except FitError as error:
-        return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
-    return _predicted(others, data)
-
-
-def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
-    """Predictions of trials, or why one cannot be predicted: the fit lacks its parameters, or its simulation fails."""
-    try:
-        return Errors(tuple(predict_prepared(fit, data, from_rest=True)), {})
-    except FitError as error:
-        if len(data) == 1:
-            return Errors((), {data[0].trial.name: str(error)})
-        return _combined([_predicted(fit, [trial_data]) for trial_data in data])
-
-
-def _combined(parts: Sequence[Errors]) -> Errors:
-    return Errors(
-        tuple(trial for part in parts for trial in part.trials),
-        {name: why for part in parts for name, why in part.not_predicted.items()},
-    )
+    solution, (information, scores) = aligned.fit.solution, aligned.information
+    squares_m2 = np.full((2, gone.size), np.nan)
+    if (root := root_without(solution, information, gone.tolist())) is not None:
+        problem, theta = solution.problem, solution.state.theta
+        # At the end of the fit the scores of all trials and the pull of the priors cancel.
+        step = np.clip(theta - root @ (root.T @ scores[gone].sum(axis=0)), problem.lower, problem.upper) - theta
+        for k, i in enumerate(gone.tolist()):
+            columns, moves = aligned.columns[i], first_that_counts(aligned.trials[i])
+            design_m = design_matrix(columns, problem.index[i], theta.size) @ np.column_stack([step, root])
+            changes_m = orthogonal_part(design_m, columns[:, aligned.nuisances(i)])[moves:]
+            squares_m2[0, k] = np.mean((columns[moves:, -1] - changes_m[:, 0]) ** 2)
+            squares_m2[1, k] = np.mean(np.sum(changes_m[:, 1:] ** 2, axis=1))
+    return squares_m2[0], squares_m2[1]

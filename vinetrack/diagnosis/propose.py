@@ -23,7 +23,7 @@ import pandas as pd
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out, with_host
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out_error, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -237,10 +237,10 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     with tempfile.TemporaryDirectory() as folder:
         before, laws = _fitted(before, best, Path(folder), report)
         report("errors on left-out conditions")
-        error_m = left_out(before).rms_m
+        error_m = left_out_error(before)
         laws.sort(key=lambda law: -law.ratio.delta_chi2)
         laws = [
-            replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
+            replace(law, rms_left_out_m=left_out_error(law.ratio.fit))
             if law.ratio.deviance_excess(laws[0].ratio) < OUT_OF_REACH
             else law
             for law in laws
@@ -256,7 +256,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         tried = [force.learned] if force.learned is not None and is_open else []
         start, tables = _fitted(before, tried, Path(folder), report)
         tables = [
-            replace(table, rms_left_out_m=left_out(table.ratio.fit).rms_m)
+            replace(table, rms_left_out_m=left_out_error(table.ratio.fit))
             for table in tables
             if _explains(start, table.ratio)
             and all(law.ratio.deviance_excess(table.ratio) > ANSWER_SET_DELTA_CHI2 for law in tied)

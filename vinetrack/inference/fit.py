@@ -59,7 +59,6 @@ from vinetrack.inference.solving import (
     trial_fit,
 )
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
-from vinetrack.inference.trial_effects import subset
 
 # ------------------------------------------------------------------------------
 # The 95 % prediction band of a trial that was not in the fit, for its position at each time.
@@ -251,30 +250,6 @@ def _with_release_and_origin_fitted(
     correlation = np.where(stretch[:, None] == stretch, state.rho ** np.abs(rows[:, None] - rows), 0.0)
     random = noise * np.sum((left @ (correlation * np.outer(sd, sd))) * left, axis=1)
     return aligned[:, :-1], random, aligned[:, -1]
-
-
-# ------------------------------------------------------------------------------
-# Fits to a subset of the trials of a fit, starting from its solution.
-#
-# Leaving out a condition, or fitting one vine or pressure alone, uses the same model on fewer data: nothing is read,
-# prepared or compiled again. Parameters that apply to none of the remaining trials (B of a vine that is left out) are
-# dropped.
-
-
-def fit_subset(fit: Fit, keep: Sequence[bool], *, most_iterations: int = MOST_ITERATIONS) -> Fit:
-    """Fit the same model to the trials of a fit that are kept, starting from its solution, with its noise and
-    between-trial standard deviations.
-    """
-    rows = np.flatnonzero(keep)
-    if not rows.size:
-        raise FitError("No trial is left to fit: keep one at least.")
-    predictor, problem, (state,) = subset(fit.predictor, fit.solution.problem, rows, fit.state)
-    held = FixedTerms(state.spread, (state.rho, state.variance))
-    try:
-        solution = solve(predictor, problem, state, held, most_iterations=most_iterations)
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated for these trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, fit.options)
 
 
 # ------------------------------------------------------------------------------

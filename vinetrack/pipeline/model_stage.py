@@ -21,9 +21,9 @@ from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
+    align_trials,
     candidates_of,
     compare,
-    in_sample,
     initial_fit,
 )
 from vinetrack.diagnosis.locate import drift_groups
@@ -233,9 +233,9 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     """
     import pandas as pd
 
-    final = {} if after is before else {one.name: one.predicted_position_m for one in in_sample(after).trials}
+    final = {} if after is before else {one.name: one.predicted_position_m for one in align_trials(after).trials}
     found = []
-    for one in in_sample(before).trials:
+    for one in align_trials(before).trials:
         measured = {"time_s": one.time_s, "lead_position_m": one.lead_position_m}
         models = {"model_before_m": one.predicted_position_m, "model_after_m": final.get(one.name, np.nan)}
         found.append((one, pd.DataFrame(measured | models)))
