@@ -22,7 +22,7 @@ from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import FAR_BEHIND, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.locate import locate
 from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
@@ -185,6 +185,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
     effects = {effect.name: effect for effect in tests.effects}
     rows = []
+    reached = max((single.fit.log_likelihood for single in singles.values()), default=-math.inf)
     for name, single in singles.items():
         in_answer_set = name in step.answer_names
         row = _refitted(
@@ -194,6 +195,8 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             along=single.others if in_answer_set else (),
             confounded_by=tuple(each for each in step.confounded if each.parameter.split(".")[0] == name),
         )
+        if not single.fit.converged and single.fit.log_likelihood < reached - FAR_BEHIND:
+            row = replace(row, numbers=(), reason=remark("given_up"))
         rows.append(row)
     for effect in (effect for name, effect in effects.items() if name not in singles):
         z, is_adequate = tests.best_z(effect.name), step.verdict == ADEQUATE

@@ -229,15 +229,19 @@ def stand_in(name: str, kind: str = "physical", parameters: tuple[Parameter, ...
     return Effect(name=name, kind=kind, summary=name, text=name, parameters=parameters, functions={}, path=Path(name))
 
 
+FAR_BEHIND = 50.0  # Difference of ln L to another hypothesis at which a fit is given up (chosen)
+
+
 def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf, **how: Any) -> Fit | None:
     """Refit with another model, or other options of `refit`; None where the fit fails. `best` is the largest ln L of
     other hypotheses: a fit that stays far behind it, or far off the tracks, is given up.
     """
     try:
-        # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
-        fit = refit(before, model, most_iterations=14, **how)
-        if fit.converged or fit.log_likelihood < best - 50.0 or is_poor_fit(fit.predictor, fit.solution):
+        # 14, 40: iterations of a full fit at first and in all (chosen)
+        least = best - FAR_BEHIND
+        fit = refit(before, model, most_iterations=14, least=least, **how)
+        if fit.converged or fit.log_likelihood < least or is_poor_fit(fit.predictor, fit.solution):
             return fit
-        return refit(fit, most_iterations=40)
+        return refit(fit, most_iterations=40, least=least)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None

@@ -145,11 +145,10 @@ class Search:
         for index in list(starts.values())[:STARTS_PER_EFFECT]:
             shape, size = shapes[index], float(tests.scores.size[index])
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
-            credible = [known for known in self.of_size(len(effects) + 1) if known.plausible and known.credible]
-            best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
-            model = tests.fit.model + shape.effect
-            near = any(not is_poor_fit(known.fit.predictor, known.fit.solution) for known in credible)
-            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best, once=near)
+            credible = (known.fit for known in self.of_size(len(effects) + 1) if known.plausible and known.credible)
+            near = (fit.log_likelihood for fit in credible if not is_poor_fit(fit.predictor, fit.solution))
+            best, model = max(near, default=-math.inf), tests.fit.model + shape.effect
+            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
             if fit is not None and gain >= FAILED_FIT_DELTA_CHI2:
                 self._keep_best(likelihood_ratio(self.before, (*effects, shape.effect), fit))

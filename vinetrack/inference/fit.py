@@ -378,7 +378,7 @@ def refit(
     hold_noise: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     afresh: bool = False,
-    once: bool = False,
+    least: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other parameters of the same model, to the same data, starting from a previous fit.
@@ -402,8 +402,9 @@ def refit(
         Maximum number of steps; a model that only has to be ruled out need not converge.
     afresh : bool
         Whether release, deviations and noise start from the tracks alone instead of the previous fit.
-    once : bool
-        Whether a fit that is poor is left so, not tried with trials that are alike: others are known to be better.
+    least : float
+        ln L that another fit reaches, less what counts as near it: a fit that cannot reach it is given up, one that is
+        poor is left so.
     watch : callable, optional
         Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
@@ -457,7 +458,7 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
-    how: dict[str, Any] = {"most_iterations": most_iterations, "once": once, "watch": watch}
+    how: dict[str, Any] = {"most_iterations": most_iterations, "least": least, "watch": watch}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             solution = solve_from(predictor, theta, fixed_terms, **how)

@@ -227,8 +227,9 @@ def solve(
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     least_decrease: float = CONVERGED_DECREASE,
+    least: float = -math.inf,
 ) -> Solution:
-    """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
+    """Iterate the mixed-effects fit to convergence, or until it cannot reach the ln L `least`. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
     Levenberg–Marquardt damping where a full step fails.
     """
@@ -240,6 +241,7 @@ def solve(
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
     damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
     columns, cross_products = _linearise(predictor, state)
+    level, searched = -math.inf, False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
@@ -254,15 +256,20 @@ def solve(
         damped = levenberg_marquardt_step(cross_products, problem, state, damping) if damping > 0 else full
         predicted_decrease = full[2]
         predictor.is_central = predicted_decrease < far_decrease
+        if least > -math.inf and not far_off:
+            level_before, level = level, log_likelihood(cross_products, problem, state, estimable_sd)
+            # As much again as the last step gained, and twice what the next one promises, would not be enough.
+            if level + max(level - level_before, predicted_decrease) < least:
+                break
         if watch is not None:
             values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
-        # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
-        # release far from the current one?
-        if small_step or iteration % 5 == 0:
+        # Before the fit ends: does a trial have a likelier release far from the current one?
+        if small_step and not searched:
             relocated = likelier_releases(predictor, problem, state)
+            searched = relocated is None
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
                 decrease = math.inf

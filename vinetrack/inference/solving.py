@@ -118,15 +118,15 @@ def _solve_or_alike(
     state: FitState,
     fixed_terms: FixedTerms,
     *,
-    once: bool = False,
+    least: float = -math.inf,
     **how: Any,
 ) -> Solution:
-    """Solve, and where the fit is poor, unless it is to be tried `once`, with trials that are alike: differences
-    between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials may differ
-    again, if a few steps of that lead near the tracks.
+    """Solve, and where the fit is poor, unless another is known to reach `least`, with trials that are alike:
+    differences between them in pressure and B take up what a model lacks, and n is meaningless then. From there trials
+    may differ again, if a few steps of that lead near the tracks.
     """
-    solution = solve(predictor, problem, state, fixed_terms, **how)
-    if once or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
+    solution = solve(predictor, problem, state, fixed_terms, least=least, **how)
+    if least > -math.inf or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
         return solution
     try:
         alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
