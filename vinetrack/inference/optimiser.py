@@ -229,9 +229,9 @@ def solve(
     least_decrease: float = CONVERGED_DECREASE,
     least: float = -math.inf,
 ) -> Solution:
-    """Iterate the mixed-effects fit to convergence, or until it cannot reach the ln L `least`. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
-    steps for the parameters alternate with estimates of noise and between-trial standard deviations;
-    Levenberg–Marquardt damping where a full step fails.
+    """Iterate the mixed-effects fit to convergence, or until ln L will clearly not reach `least`. Method:
+    Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton steps for the parameters alternate with estimates of
+    noise and between-trial standard deviations; Levenberg–Marquardt damping where a full step fails.
     """
     fixed_terms, estimable_sd = fixed_terms or FixedTerms(), estimable(problem)
     if fixed_terms.spread is not None:
