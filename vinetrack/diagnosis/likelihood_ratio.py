@@ -237,10 +237,10 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
     other hypotheses: a fit that stays far behind it, or far off the tracks, is given up.
     """
     try:
-        # 14, 40: iterations of a full fit at first and in all (chosen)
-        least = best - FAR_BEHIND
-        fit = refit(before, model, most_iterations=14, least=least, **how)
-        if fit.converged or fit.log_likelihood < least or is_poor_fit(fit.predictor, fit.solution):
+        # 14, 40: iterations of a full fit at first, and of one that is near then (chosen)
+        first, least = 14, best - FAR_BEHIND
+        fit = refit(before, model, most_iterations=first, least=least, **how)
+        if fit.converged or fit.iterations < first or is_poor_fit(fit.predictor, fit.solution):
             return fit
         return refit(fit, most_iterations=40, least=least)
     except (FitError, SimulationError, np.linalg.LinAlgError):

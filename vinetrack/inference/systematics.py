@@ -198,18 +198,20 @@ def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
 
 
 def _slow_shapes(part: Floats, slow_m: Floats) -> Floats:
-    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m. Waves along the growth
+    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 5), m. Waves along the growth
     have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
-    the very start and one after it; two more grow towards the end.
+    the very start and one after it; two more grow towards the end. The tip at rest lies before background that no frame
+    shows, the same for all recordings of a camera that stands still.
     """
     end_shapes = ((0.1, 2.0), (0.03, 4.0))  # Fractions of the growth before its end (measured)
     usual = np.minimum(slow_m, np.median(slow_m))
     excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
-    # 0.015: fraction of the growth over which a slow error that is larger at the start may decay (chosen)
-    start = np.exp(-np.maximum(part, 0.0) / 0.015)
+    # 0.015, 0.002: fractions of the growth over which a slow error that is larger at the start, and the error at rest,
+    # may decay: a door, and the blur of the edge (chosen)
+    start, rest = (np.exp(-np.maximum(part, 0.0) / fraction) for fraction in (0.015, 0.002))
     ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in end_shapes]
-    return np.column_stack([waves, excess * start, excess * (1 - start), *ends])
+    return np.column_stack([waves, excess * start, excess * (1 - start), slow_m * rest, *ends])
 
 
 def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
