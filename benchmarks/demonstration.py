@@ -9,7 +9,8 @@ SD, robust SD (1.4826 × median absolute deviation) and bias: of tracked minus t
 of the picture, over frames in which the edge truly moves (an origin is free in every analysis, so a bias costs
 nothing). Pull: SD of the error over each point's stated error, 1 where stated errors are right. Lost: moving frames
 without a usable position. Scale: error of the length from the first to the last moving frame's true place by the
-calibration, against the stated relative error of the scale.
+calibration, against the stated relative error of the scale. Lens: the range of the error of these true places by the
+calibration. Places: SD of tracked minus true places, of edge and lens together. Both are in µm.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ class Row:
     pull: float
     scale_error: float
     scale_sigma: float
+    lens_um: float
+    places_um: float
 
 
 def film_demonstration(folder: Path, processes: int) -> tuple[Experiment, dict[str, Truth]]:
@@ -84,9 +87,9 @@ def compare(name: str, measured: Measurement, truth: Truth) -> Row:
     error_px = track.edge_px[used] - true_px[used]
     stated_px = np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[used] / measured.m_per_px
     off = error_px - np.median(error_px)
-    first, last = np.flatnonzero(moving)[[0, -1]]
-    true_m = truth.lead_position_m[last] - truth.lead_position_m[first]
-    scaled_m = _length(measured, tips[first], tips[last])
+    assert measured.calibration is not None
+    seen_m = measured.calibration.along(axis).position_m(tips[moving])
+    true_m = truth.lead_position_m[moving]
     return Row(
         name,
         int(moving.sum()),
@@ -96,16 +99,11 @@ def compare(name: str, measured: Measurement, truth: Truth) -> Row:
         float(error_px.mean()),
         float(np.sqrt(np.mean(stated_px**2))),
         float(np.std(off / stated_px)),
-        float(scaled_m / true_m - 1),
+        float((seen_m[-1] - seen_m[0]) / (true_m[-1] - true_m[0]) - 1),
         measured.scale_rel_sigma,
+        float(1e6 * np.ptp(seen_m - true_m)),
+        float(1e6 * np.std((track.lead_position_m - truth.lead_position_m)[used])),
     )
-
-
-def _length(measured: Measurement, start_px: np.ndarray, end_px: np.ndarray) -> float:
-    assert measured.calibration is not None
-    axis = measured.tracking.axis
-    position_m = measured.calibration.along(axis).position_m(np.stack([start_px, end_px]))
-    return float(position_m[1] - position_m[0])
 
 
 def measure_all(experiment: Experiment, truths: dict[str, Truth]) -> Iterator[Row]:
@@ -117,18 +115,20 @@ def measure_all(experiment: Experiment, truths: dict[str, Truth]) -> Iterator[Ro
 
 def show(rows: Iterator[Row]) -> None:
     """Print the table as it comes, then the medians."""
-    heads = ("moving", "lost", "SD", "robust", "bias", "stated", "pull", "scale err", "stated")
+    heads = ("moving", "lost", "SD", "robust", "bias", "stated", "pull", "scale err", "stated", "lens", "places")
     print(f"{'recording':18s}" + "".join(f"{head:>10s}" for head in heads))
     done = []
     for row in rows:
         done.append(row)
         px = f"{row.sd_px:10.3f}{row.robust_px:10.3f}{row.bias_px:+10.3f}{row.stated_px:10.3f}{row.pull:10.2f}"
         scale = f"{100 * row.scale_error:+9.4f}%{100 * row.scale_sigma:9.4f}%"
+        scale += f"{row.lens_um:10.1f}{row.places_um:10.1f}"
         print(f"{row.name:18s}{row.n_moving:10d}{row.lost:10d}{px}{scale}", flush=True)
 
     def median(name: str) -> float:
         return float(np.median([getattr(row, name) for row in done]))
 
+    print(f"median error of the lens {median('lens_um'):.1f} µm, of places {median('places_um'):.1f} µm")
     lost, moving = sum(row.lost for row in done), sum(row.n_moving for row in done)
     fair = sum(1 / 1.5 <= row.sd_px / row.stated_px <= 1.5 for row in done)
     print(f"\nmedian SD {median('sd_px'):.3f} px, robust {median('robust_px'):.3f} px, pull {median('pull'):.2f}")

@@ -131,6 +131,8 @@ SCORES: tuple[Score, ...] = (
       for name in ("n", "B", "P_y", "gamma")),
     *(Score(f"95 % intervals, 2 to 7 trials or drops: hold {name}", "few/*", holds(name), "share of all")
       for name in ("n", "B", "P_y", "C_D")),
+    Score("demonstration: error of the lens, µm, median", "tracking/demonstration", number("lens_um"), "median"),
+    Score("demonstration: error of places, µm, median", "tracking/demonstration", number("places_um"), "median"),
     *tracked("like the demonstration", "demo-like"), *tracked("hard presets", "hard *"),
     *tracked("another renderer", "other renderer"), *tracked("bent paths", "bent"),
     Score("long doors: axis off", "tracking/long door", number("askew")),

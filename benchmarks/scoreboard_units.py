@@ -146,6 +146,11 @@ def tracking(name: str, seed: int, folder: Path, known: object) -> list[Row]:  #
 
         line, refused, askew, wrong = long_doors.judged(seed, folder)
         return [{"clips": _checksum(folder), "line": line, "refused": refused, "askew": askew, "wrong": wrong}]
+    if name == "demonstration":
+        import demonstration
+
+        experiment, truths = demonstration.film_demonstration(folder, 1)
+        return [vars(row) for row in demonstration.measure_all(experiment, truths)]
     if name == "demo-like":
         rows = tracking_accuracy.demo_rows(list(range(seed, seed + 8)), folder)
     elif name == "other renderer":
@@ -291,7 +296,7 @@ def _shuffled(names: Sequence[str]) -> list[str]:
 
 
 CLIPS = (
-    *("demo-like", "long door", "long door", "long door"),
+    *("demonstration", "demo-like", "long door", "long door", "long door"),
     *(f"hard {name}" for name in _shuffled(HARD + BODIES)),
     *("other renderer", "bent"),
     *("long door",) * 9,
@@ -299,7 +304,7 @@ CLIPS = (
 
 GROUPS: dict[str, Group] = {
     "size": Group(house, ("code",), 1, 1),
-    "tracking": Group(tracking, CLIPS, 10, len(CLIPS)),
+    "tracking": Group(tracking, CLIPS, 11, len(CLIPS)),
     "null": Group(diagnosed, _shuffled(kinds("nulls")), 8, 20),
     "effect": Group(diagnosed, _shuffled(kinds("effects")), 9, 29),
     "pair": Group(diagnosed, _shuffled(kinds("pairs")), 1, 5),
