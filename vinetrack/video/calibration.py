@@ -64,7 +64,10 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     if layout is None or share < LEAST_IN_PLACE or abs(marker_mm / board.marker_mm - 1) > 0.10:
         seen = f"{len(ids)} markers of {board.dictionary} are seen"
         raise _not_as_stated(picture, f"{seen}, {share:.0%} of them where the board has them, {marker_mm:.3g} mm wide")
-    found_px, found_ids, _, _ = cv2.aruco.CharucoDetector(layout).detectBoard(
+    # OpenCV stops refining corners at steps of 0.1 px, near where the markers' corners led it.
+    fine = cv2.aruco.DetectorParameters()
+    fine.cornerRefinementMinAccuracy, fine.cornerRefinementMaxIterations = 1e-3, 100
+    found_px, found_ids, _, _ = cv2.aruco.CharucoDetector(layout, detectorParams=fine).detectBoard(
         grey, markerCorners=list(corners), markerIds=ids
     )
     places = np.empty(0, int) if found_ids is None else found_ids.ravel()
