@@ -124,18 +124,6 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
     return (grid.shape[1] + 1, grid.shape[0] + 1) if max(bends) < 0.1 * step else None
 
 
-def _enlarged(grey: Grey, times: int) -> Grey:
-    """The picture, or a larger copy for squares that are only a few pixels wide."""
-    import cv2
-
-    return np.asarray(cv2.resize(grey, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC))
-
-
-def _in_original(corners_px: NDArray[Any], times: int) -> Floats:
-    """Convert places in an enlarged copy: its pixel 0 is centred on ½/times − ½ of the picture's."""
-    return (np.asarray(corners_px, dtype=float) + 0.5) / times - 0.5
-
-
 def _dictionary(name: str) -> Any:
     """A dictionary of markers by its name in OpenCV."""
     import cv2
@@ -165,13 +153,16 @@ def _best_layout(
 def _detect_markers(
     grey: Grey, dictionary: Any, enlarge: int = 1
 ) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1)."""
+    """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1), from the picture or a larger copy,
+    for squares that are only a few pixels wide. Pixel 0 of a copy is centred on ½/enlarge − ½ of the picture's.
+    """
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(_enlarged(grey, enlarge))
+    copy = cv2.resize(grey, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(copy)
     if ids is None:
         return [], np.empty((0, 1), np.int32)
-    return [_in_original(corner, enlarge).astype(np.float32) for corner in corners], np.asarray(ids)
+    return [((corner + 0.5) / enlarge - 0.5).astype(np.float32) for corner in corners], np.asarray(ids)
 
 
 def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], board: Charuco) -> tuple[float, float]:
