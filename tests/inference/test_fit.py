@@ -404,6 +404,17 @@ def test_what_nothing_moves_or_has_no_mass_and_unknown_parameters_are_refused():
             vt.fit(vt.base_model(), given, fixed=fixed)
 
 
+def test_a_fit_that_cannot_reach_what_another_does_is_given_up(campaign):
+    whole, *_ = campaign
+    dragged, far = whole.model + "air_drag", {"air_drag.C_D": 60.0}
+    free = vt.refit(whole, dragged, start=far)
+    near = vt.refit(whole, dragged, start=far, least=free.log_likelihood - 1)
+    assert (near.log_likelihood, near.iterations) == (free.log_likelihood, free.iterations)
+    hopeless = vt.refit(whole, dragged, start=far, least=free.log_likelihood + 1000)
+    assert not hopeless.converged
+    assert hopeless.iterations < free.iterations
+
+
 def test_a_refit_takes_a_model_and_no_name(campaign):
     whole, *_ = campaign
     with pytest.raises(vt.FitError):
