@@ -70,10 +70,12 @@ def solve_from(
     predictor: Predictor,
     theta: Floats,
     fixed_terms: FixedTerms,
+    *,
+    least: float = -math.inf,
     **how: Any,
 ) -> Solution:
     """Solve from given parameters and the releases that suit them, with the initial noise and standard deviations of
-    `first_state`; `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
+    `first_state`; `least` and `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
     """
     trial_effects, _ = align(predictor, theta, initial_trial_effects(predictor.data))
     problem, state = make_problem(predictor, trial_effects), first_state(predictor.data, theta, trial_effects)
@@ -81,7 +83,7 @@ def solve_from(
         state, poor = _solved_for_part(predictor, problem, state, fixed_terms, rows, **how)
         if poor:  # It only has to be ruled out.
             fixed_terms, how = replace(fixed_terms, spread=ALIKE), how | {"most_iterations": STEPS_TO_TELL}
-    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
+    return _solve_or_alike(predictor, problem, state, fixed_terms, least=least, **how)
 
 
 def _part(predictor: Predictor) -> NDArray[np.int_]:
