@@ -266,10 +266,11 @@ def solve(
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
-        # Before the fit ends: does a trial have a likelier release far from the current one?
-        if small_step and not searched:
+        # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
+        # release far from the current one?
+        if (small_step and not searched) or iteration % 5 == 0:
             relocated = likelier_releases(predictor, problem, state)
-            searched = relocated is None
+            searched = small_step and relocated is None
             if relocated is not None:
                 state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
                 decrease = math.inf
