@@ -240,7 +240,8 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
         # 14, 40: iterations of a full fit at first, and of one that is near then (chosen)
         first, least = 14, best - FAR_BEHIND
         fit = refit(before, model, most_iterations=first, least=least, **how)
-        if fit.converged or fit.iterations < first or is_poor_fit(fit.predictor, fit.solution):
+        is_done = fit.converged or fit.iterations < first or fit.log_likelihood < least
+        if is_done or is_poor_fit(fit.predictor, fit.solution):
             return fit
         return refit(fit, most_iterations=40, least=least)
     except (FitError, SimulationError, np.linalg.LinAlgError):
