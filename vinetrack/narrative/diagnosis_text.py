@@ -332,7 +332,8 @@ def drift_text(row: Mapping[str, Any], stated_sigma_Pa: float = math.nan, pressu
     facts = {**row, "who": who, "amount": f"{change:.{digits}f} ± {error:.{digits}f} %"}
     if against == "sheet":
         levels = {"from_level": start, "to_level": stop, "sigma": stated_sigma_Pa}
-        shown = {name: units.convert(level, "Pa", pressure_unit) for name, level in levels.items()}
+        shown: dict[str, Any] = {name: units.convert(one, "Pa", pressure_unit) for name, one in levels.items()}
+        shown |= {"stated": units.with_error(shown["from_level"], shown["sigma"])}
         return sentence("drifts_from_sheet", facts | shown | {"unit": units.UNITS[pressure_unit].text})
     name, unit, times = drift_condition(against, pressure_unit)
     facts |= {"name": name, "low": f"{start * times:.3g} {unit}", "high": f"{stop * times:.3g} {unit}"}
