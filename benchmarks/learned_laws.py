@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import FittedMotion
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out_error
 from vinetrack.diagnosis.missing_force import LearnedForce, missing_force
 from vinetrack.diagnosis.propose import propose
 
@@ -124,7 +124,7 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
         proposal = propose(vt.base_model(), pairs, lambda _: None)
         row["proposed"] = proposal.tied[0].effect.name if proposal.tied else ""
         row["propose_s"] = time.process_time() - begun
-        true_m = left_out(true_fit(proposal.before, campaign.truth)).rms_m
+        true_m = left_out_error(true_fit(proposal.before, campaign.truth))
         row["before"] = proposal.rms_left_out_m / true_m
         row["after"] = proposal.tied[0].rms_left_out_m / true_m if proposal.tied else math.nan
         row["with_table"] = math.nan if proposal.table is None else proposal.table.rms_left_out_m / true_m

@@ -21,7 +21,6 @@ from vinetrack.diagnosis.ladder import (
     excess,
     highest_pressures,
     ladder,
-    left_out,
     left_out_error,
     rms_of,
 )
@@ -34,6 +33,7 @@ from vinetrack.inference.fit import fit, predict_prepared, refit
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import EXPONENT, Number
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
+from vinetrack.pipeline import model_stage
 
 DEPLETION = "reservoir_depletion"
 
@@ -136,7 +136,7 @@ def test_every_trial_is_left_out_and_the_highest_pressure_is_that_of_its_vine(pa
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
     found = vt.fit(vt.base_model(), lower)
     aligned = align_trials(found)
-    assert np.isfinite(left_out(aligned)[0]).all()
+    assert np.isfinite(aligned.left_out[0]).all()
     highest = [aligned.trials[i].trial.name for i in highest_pressures(aligned)]
     assert sorted(highest) == ["R2_48kPa_1", "R4_38kPa_1"]
     # Without replicates there is no floor.
@@ -149,7 +149,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
     single = [pair for pair in pairs if pair[0].name.startswith("R2") or "_38kPa" in pair[0].name]
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single)
     table = ladder([found], [""])
-    assert np.count_nonzero(np.isnan(left_out(align_trials(found))[0])) == 3
+    assert np.count_nonzero(np.isnan(align_trials(found).left_out[0])) == 3
     assert math.isfinite(table["rms_left_out_m"].iloc[0])
     note = table.attrs["notes"][0]
     assert (note.code, note.facts["left_out"], note.facts["count"]) == ("left_out_error_without", "conditions", 3)
@@ -158,6 +158,19 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
         result.Diagnosis(rounds=(result.Round(verdict="adequate"),), effects=(), explanation="", fits=(found,))
     )
     assert told.notes == tuple(table.attrs["notes"])
+
+
+def test_a_model_that_cannot_be_followed_costs_its_own_predictions_alone(fits, monkeypatch):
+    def followed(fit):
+        if fit is fits[1]:
+            raise vt.FitError("it ends at 1.4 s")
+        return align_trials(fit)
+
+    monkeypatch.setattr(model_stage, "align_trials", followed)
+    tables = [table for _, table in model_stage.predictions(*fits)]
+    assert len(tables) == len(fits[0].trials)
+    assert all(table["model_before_m"].notna().all() and table["model_after_m"].isna().all() for table in tables)
+    assert model_stage.predictions(fits[1], fits[1]) == []
 
 
 def test_of_a_single_condition_nothing_can_be_left_out(pairs):

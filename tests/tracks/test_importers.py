@@ -1,5 +1,6 @@
 """Positions and pressures measured elsewhere: CSV, Physics Tracker, TDMS, written by hand here."""
 
+import contextlib
 import io
 from pathlib import Path
 
@@ -399,3 +400,12 @@ NO_TRACES = {
 def test_unsupported_content_is_refused(tmp_path, made):
     with pytest.raises(InputError):
         read_tdms(tmp_path, made)
+
+
+def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path):
+    for place in range(len(BOTH_CHANNELS)):
+        damaged = bytearray(BOTH_CHANNELS)
+        damaged[place] ^= 0x5A
+        with contextlib.suppress(InputError):
+            time_s, pressure_Pa = read_tdms(tmp_path, bytes(damaged))
+            assert time_s.shape == pressure_Pa.shape

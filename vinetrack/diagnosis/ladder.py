@@ -31,7 +31,7 @@ from vinetrack.core.units import number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.errors import root_without, trial_information
+from vinetrack.inference.errors import trial_information, without
 from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, rest_is_seen
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
@@ -210,6 +210,15 @@ class AlignedTrials:
     def information(self) -> tuple[Floats, Floats]:
         """`trial_information` of the fit."""
         return trial_information(self.fit.solution)
+
+    @cached_property
+    def left_out(self) -> tuple[Floats, Floats]:
+        """`errors_without` the condition of each trial (cross-validation)."""
+        names = np.array([trial.trial.condition for trial in self.trials])
+        squares_m2 = np.empty((2, names.size))
+        for name in np.unique(names):
+            squares_m2[:, names == name] = errors_without(self, np.flatnonzero(names == name))
+        return squares_m2[0], squares_m2[1]
 
     def nuisances(self, i: int) -> list[int]:
         """Columns of release and, where no standstill was seen, origin of one trial."""
@@ -451,11 +460,11 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     notes: list[Remark] = []
     settled = align_trials(fits[len(fits) - partial - 1])
     floor_m, courses = settled.floor_m, list(itertools.chain(*settled.courses.values()))
-    by_parameters_m = np.nan_to_num(root_mean(left_out(settled)[1]))
+    by_parameters_m = np.nan_to_num(root_mean(settled.left_out[1]))
     expected = expected_error(courses, settled.scatter, by_parameters_m**2)
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         aligned = settled if enlarged is settled.fit else align_trials(enlarged)
-        outside_m2, highest_m2 = left_out(aligned)[0], without(aligned, highest_pressures(aligned))[0]
+        outside_m2, highest_m2 = aligned.left_out[0], errors_without(aligned, highest_pressures(aligned))[0]
         rows.append(
             {
                 "model": "+".join(enlarged.model.names),
@@ -489,18 +498,9 @@ def root_mean(squares: Floats) -> float:
     return math.sqrt(np.mean(known)) if known.size else math.nan
 
 
-def left_out(aligned: AlignedTrials) -> tuple[Floats, Floats]:
-    """`without` the condition of each trial (cross-validation)."""
-    names = np.array([trial.trial.condition for trial in aligned.trials])
-    squares = np.empty((2, names.size))
-    for name in np.unique(names):
-        squares[:, names == name] = without(aligned, np.flatnonzero(names == name))
-    return squares[0], squares[1]
-
-
 def left_out_error(fit: Fit) -> float:
     """Error of a fitted model on conditions left out, rms, m."""
-    return root_mean(left_out(align_trials(fit))[0])
+    return root_mean(align_trials(fit).left_out[0])
 
 
 def highest_pressures(aligned: AlignedTrials) -> NDArray[np.intp]:
@@ -510,20 +510,17 @@ def highest_pressures(aligned: AlignedTrials) -> NDArray[np.intp]:
     return np.flatnonzero(pressures_Pa >= highest_Pa)
 
 
-def without(aligned: AlignedTrials, gone: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def errors_without(aligned: AlignedTrials, gone: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Mean squares in motion, m², of the errors of some trials as the fit to all others predicts them, and of what the
     errors of its parameters contribute; NaN where the others do not determine what these depend on. Shapes: gone (n,) →
     (n,), (n,).
     """
-    solution, (information, scores) = aligned.fit.solution, aligned.information
-    squares_m2 = np.full((2, gone.size), np.nan)
-    if (root := root_without(solution, information, gone.tolist())) is not None:
-        problem, theta = solution.problem, solution.state.theta
-        # At the end of the fit the scores of all trials and the pull of the priors cancel.
-        step = np.clip(theta - root @ (root.T @ scores[gone].sum(axis=0)), problem.lower, problem.upper) - theta
+    squares_m2, index = np.full((2, gone.size), np.nan), aligned.fit.solution.problem.index
+    if (known := without(aligned.fit.solution, *aligned.information, gone.tolist())) is not None:
+        moved = np.column_stack(known)
         for k, i in enumerate(gone.tolist()):
             columns, moves = aligned.columns[i], first_that_counts(aligned.trials[i])
-            design_m = design_matrix(columns, problem.index[i], theta.size) @ np.column_stack([step, root])
+            design_m = design_matrix(columns, index[i], len(moved)) @ moved
             changes_m = orthogonal_part(design_m, columns[:, aligned.nuisances(i)])[moves:]
             squares_m2[0, k] = np.mean((columns[moves:, -1] - changes_m[:, 0]) ** 2)
             squares_m2[1, k] = np.mean(np.sum(changes_m[:, 1:] ** 2, axis=1))

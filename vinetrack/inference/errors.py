@@ -221,15 +221,22 @@ def _covariance_by_noise(solution: Solution, information: Floats) -> Floats:
     return inverse_of_block(square, np.flatnonzero(problem.free & inside & (np.diag(square) > 0)))
 
 
-def root_without(solution: Solution, information: Floats, trials: Sequence[int]) -> Floats | None:
-    """Root of the covariance of the unknowns by all trials but these; None where those do not determine what these
-    depend on.
+def without(
+    solution: Solution, information: Floats, scores: Floats, trials: Sequence[int]
+) -> tuple[Floats, Floats] | None:
+    """The step of the unknowns to the fit to all other trials, to first order, and a root of their covariance by those;
+    None where those do not determine what these depend on. `information` and `scores` are `trial_information`.
     """
-    kept = np.delete(information, trials, axis=0)
-    by_all, by_others = (np.einsum("nkk->k", each) + solution.problem.prior_precision for each in (information, kept))
+    problem, theta, kept = solution.problem, solution.state.theta, np.delete(information, trials, axis=0)
+    by_all, by_others = (np.einsum("nkk->k", each) + problem.prior_precision for each in (information, kept))
     # 1e-6: part of the information on a parameter that must come from other trials (chosen)
-    lost = solution.problem.free & (by_others < by_all) & (by_others <= 1e-6 * by_all)
-    return None if lost.any() else matrix_root(_covariance_by_noise(solution, kept))
+    lost = problem.free & (by_others < by_all) & (by_others <= 1e-6 * by_all)
+    if lost.any():
+        return None
+    root = matrix_root(_covariance_by_noise(solution, kept))
+    # At the end of the fit the scores of all trials and the pull of the priors cancel.
+    reached = theta - root @ (root.T @ scores[trials].sum(axis=0))
+    return np.clip(reached, problem.lower, problem.upper) - theta, root
 
 
 def scatter_variances(

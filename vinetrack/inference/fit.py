@@ -25,7 +25,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
-from vinetrack.inference.errors import root_without, student, trial_information
+from vinetrack.inference.errors import student, trial_information, without
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import whiten
@@ -147,12 +147,12 @@ def _leave_one_out(
     trials do not determine all parameters on which it depends.
     """
     problem, state = solution.problem, solution.state
-    if (root := root_without(solution, information, [i])) is None:
+    if (known := without(solution, information, scores, [i])) is None:
         return None
-    columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
-    design = design_matrix(columns, problem.index[i], problem.prior_mean.size) @ root
-    shift = root.T @ (scores[i] - scores.mean(axis=0))
-    residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
+    columns, deviations, (step, root) = solution.columns[i], [PRESSURE, DAMPING_DEVIATION], known
+    moved = design_matrix(columns, problem.index[i], step.size)
+    residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] - moved @ step
+    design = moved @ root
     own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
     loadings = np.column_stack([design, _deviation_loadings(own_sd, columns, trial_data)])
     noise = float(state.variance[i]) / (1 - state.rho**2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -233,13 +233,22 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     """
     import pandas as pd
 
-    final = {} if after is before else {one.name: one.predicted_position_m for one in align_trials(after).trials}
+    final = {} if after is before else {one.name: one.predicted_position_m for one in _followed(after)}
     found = []
-    for one in align_trials(before).trials:
+    for one in _followed(before):
         measured = {"time_s": one.time_s, "lead_position_m": one.lead_position_m}
         models = {"model_before_m": one.predicted_position_m, "model_after_m": final.get(one.name, np.nan)}
         found.append((one, pd.DataFrame(measured | models)))
     return found
+
+
+def _followed(fit: Fit) -> Sequence[TrialFit]:
+    """The trials as a model predicts them; none where it cannot be followed through one of them."""
+    try:
+        return align_trials(fit).trials
+    except FitError as error:
+        log.info("no predictions of %s: %s", fit.model, error)
+        return ()
 
 
 def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
