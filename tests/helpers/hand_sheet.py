@@ -9,7 +9,7 @@ import pytest
 from vinetrack.experiment.folder import Experiment, ExperimentError, Problem, read_experiment
 
 HEADER = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,payload_g"
-GOOD = f"{HEADER}\na,a.csv,24,200,280,28,3,35.6\nb,b.csv,24,200,280,14,3,\n"
+GOOD = f"{HEADER}\na,a.csv,24,200,280,28,3,35.6\nb,b.csv,24,200,280,14,3,0\n"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i * i / 1e6}\n" for i in range(20))
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.problems import InputError
+from vinetrack.core.problems import InputError, joined
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number, safe_join
 from vinetrack.core.units import UNITS, Unit, convert, split_unit
@@ -92,8 +92,8 @@ class Column:
         """Return a trial's value of this column."""
         return self.scale.from_si(float(getattr(trial, self.field)))
 
-    def read(self, text: str, decimal: str = ".") -> Any:
-        """Return the value of a non-blank cell, in the unit of its column."""
+    def read(self, text: str, decimal: str = ".", written_in: str = "") -> Any:
+        """Return the value of a non-blank cell, in the unit of its column; it was written in another, or in its own."""
         try:
             match self.kind:
                 case "text":
@@ -113,7 +113,7 @@ class Column:
                     return _read_axis(text)
             number, unit = value_and_unit(text, self.name)
             value = parse_number(number, decimal)
-            return self._checked(convert(value, unit, self.unit_key) if unit else value)
+            return self._checked(convert(value, unit, self.unit_key) if unit else value, unit or written_in)
         except InputError as error:
             error.allowed = self.allowed
             raise
@@ -124,16 +124,16 @@ class Column:
             raise InputError("is not a single value", "write one, as in the sheet", code="not_a_value")
         return self.read(str(value).strip())
 
-    def _checked(self, value: float) -> float:
+    def _checked(self, value: float, written_in: str = "") -> float:
         """Return the value unchanged if its column allows it."""
         if self.kind == "choice" and value not in (1, 2):
             raise InputError("is not a travel ratio", code="not_a_choice")
         if value > self.high:
             message = f"is above {self.high:g} {self.unit}"
-            raise InputError(message, self._likely_unit(value), code="above_bounds")
+            raise InputError(message, self._likely_units(value, written_in or self.unit_key), code="above_bounds")
         if value < self.low or (self.above_low and value == self.low):
             message = f"{'is not above' if self.above_low else 'is below'} {self.low:g} {self.unit}".strip()
-            raise InputError(message, self._likely_unit(value), code="below_bounds")
+            raise InputError(message, self._likely_units(value, written_in or self.unit_key), code="below_bounds")
         return value
 
     def unusual(self, value: Any) -> str:
@@ -141,15 +141,15 @@ class Column:
         is_unusual = self.kind == "number" and value is not None and value != 0 and value < self.usual_from
         return f"is unusual: {self.unusual_hint}" if is_unusual else ""
 
-    def _likely_unit(self, value: float) -> str:
-        """Name the unit in which the value was probably written, if the column would allow it in that unit."""
+    def _likely_units(self, value: float, written_in: str) -> str:
+        """Ask for the units in which the number as it was written would be a usual one of this column."""
+        told, least = [], max(self.low, self.usual_from, 1e-9)
         for key in self.slips:
-            unit, factor = UNITS[key].text, convert(1.0, key, self.unit_key)
-            meant = value * factor
-            # It must bring the value into range: enlarge one that is too small, shrink one that is too large.
-            if (factor > 1) == (value < self.high) and max(self.low, 1e-9) <= meant <= self.high:
-                return f"looks like {unit}: {value:g} {unit} is {meant:g} {self.unit}"
-        return ""
+            typed = convert(value, self.unit_key, written_in)
+            if key != written_in and least <= convert(typed, key, self.unit_key) <= self.high:
+                meant = f"{convert(typed, key, written_in):.3g} {UNITS[written_in].text}"
+                told.append(f"{typed:g} {UNITS[key].text} ({meant})")
+        return f"is it {joined(told, 'or')}?" if told else ""
 
 
 def _read_columns() -> dict[str, Column]:

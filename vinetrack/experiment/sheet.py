@@ -159,7 +159,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
                 typed = f"{value:.6g} {UNITS[of_column].text}"
         try:
             if text:
-                row.values[name] = column.read(text, table.decimal)
+                row.values[name] = column.read(text, table.decimal, table.units.get(name, ""))
                 if said := column.unusual(row.values[name]):
                     said = said if typed == text else "is unusual: is the unit in the name of its column right?"
                     row.add("unusual", said, name, "warning", value=typed)
