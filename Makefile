@@ -10,6 +10,7 @@ help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
 
 venv: $(STAMP)  ## .venv with the locked version of everything, extras included
+	@echo 'Done. Next: make demo, or $(BIN)/vinetrack setup FOLDER'
 
 demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, to results/demo/report.html
 	@$(BIN)/vinetrack run data/demo --cores $(CORES)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import grown as campaigns
 import numpy as np
+import pandas as pd
 import pytest
 from grown import Pairs
 from hidden import make, shots
@@ -22,13 +23,13 @@ from tube.models import fit_tubes, models, threshold_kPa
 from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
-from vinetrack.core.problems import Remark, remark
+from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
-from vinetrack.diagnosis.diagnose import not_better, with_lost_frames
+from vinetrack.diagnosis.diagnose import with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
-from vinetrack.diagnosis.ladder import align_trials, with_host
+from vinetrack.diagnosis.ladder import align_trials, not_better, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
@@ -437,9 +438,10 @@ def plain():
 
 
 def test_an_effect_that_predicts_no_condition_better_is_said_to():
-    expected = remark("left_out_error_does_not_fall", name="latch_release", without_m=4.09e-3, with_m=4.09e-3)
-    assert not_better(("latch_release",), [4.09e-3, 4.09e-3]) == [expected]
-    assert not_better(("latch_release",), [4.09e-3, 3.2e-3]) == not_better(("leak",), [4.09e-3, np.nan]) == []
+    table = pd.DataFrame({"added": ["", "latch_release"], "rms_left_out_m": [4.09, 4.09]})
+    told = not_better(table.assign(rms_highest_pressure_m=[3.88, 4.16]))
+    assert [(one.code, one.facts["highest"]) for one in told] == [("left_out_error_does_not_fall", k) for k in (0, 1)]
+    assert not_better(table.assign(rms_left_out_m=[4.09, 3.2], rms_highest_pressure_m=np.nan)) == []
 
 
 @pytest.mark.slow

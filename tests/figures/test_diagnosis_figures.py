@@ -24,7 +24,7 @@ def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis():
     assert "(mm)" in ax.get_ylabel()
     curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
     assert np.array(curves) == pytest.approx(np.array([[9, 1.8], [10, 2], [11, 2.2]]))
-    assert [label.get_text() for label in ax.get_xticklabels()] == ["initial\nmodel", "+ reservoir\ndepletion"]
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["refuted\ninitial model", "+ reservoir\ndepletion"]
 
 
 def test_a_condition_is_drawn_before_and_after_with_its_errors():

@@ -27,7 +27,7 @@ from vinetrack.diagnosis.result import (
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import templates
 from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines, table_lines
-from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_sentence, verdict_table
+from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_line, verdict_sentence, verdict_table
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -115,6 +115,13 @@ def test_the_last_lines_of_a_run_begin_with_how_sure_the_verdict_is():
     told = Diagnosis.from_json(diagnosis("missing"))
     for in_short in (False, True):
         assert table_lines(told, in_short=in_short)[0].strip().startswith("How sure") == in_short
+
+
+def test_a_refuted_model_is_known_and_an_extended_adequate_one_is_told_by_what_was_added():
+    found = Diagnosis.from_json(diagnosis("missing"))
+    assert [found.refutes(model) for model in ((), found.final_model, ["leak"])] == [True, False, False]
+    after = replace(found, rounds=found.rounds[1:], effects=())
+    assert ["γ = 1.1700 ± 0.0040" in verdict_line(each) for each in (after, found)] == [True, False]
 
 
 def test_what_the_verdict_names_is_not_said_to_be_beyond_detection():

@@ -158,6 +158,7 @@ def test_a_diagnosis_appears_when_the_page_is_opened_again(campaign, background,
     again = Browser(own)
     assert f"<b>{again.page.diagnosis.verdict}</b>" in again.text("verdict")
     assert "chamber (l)" in again.text("next")
+    assert "refutes" in again.text("headline")
     assert again.page.panel.root.children[0].children[0].label == "Suspected by the diagnosis"
     known = again.page.diagnosis
     assert suspects(replace(known, rounds=(replace(known.rounds[0], verdict="adequate"),))) == ()

@@ -98,7 +98,10 @@ def test_shared_values_are_set_in_place_and_in_the_unit_chosen():
     assert "yield_pressure_kPa" not in parse_yaml(after, "").content
     both = draft.with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
     assert parse_yaml(both, "").content == {"yield_pressure_psi": 0.42}
-    assert parse_yaml(draft.with_shared(after, {"yield_pressure_kPa": "3"}), "").content["yield_pressure_kPa"] == 3
+    for typed, kPa in (("3", 3), ("0.035 bar", 3.5), ("5 furlong", "5 furlong")):
+        assert (
+            parse_yaml(draft.with_shared(after, {"yield_pressure_kPa": typed}), "").content["yield_pressure_kPa"] == kPa
+        )
 
 
 COLUMNS = ["capture_fps", "diameter_mm", "pressure_kPa", "payload_g"]
@@ -122,7 +125,7 @@ def notes(text: str, at_column: str = "trial") -> int:
 
 
 @pytest.mark.parametrize("mark", ["\t", ";", ",", "  "])
-@pytest.mark.parametrize("header", ["clip{0}pressure (psi){0}payload_g", "Trial{0}Pressure [psi]{0}Payload"])
+@pytest.mark.parametrize("header", ["clip{0}pressure (psi){0}load g", "Trial{0}Pressure [psi]{0}Load"])
 @pytest.mark.parametrize("at_column", ["trial", "payload_g"])
 def test_a_header_names_columns_and_units_and_rows_are_those_of_their_clips(mark, header, at_column):
     lines = [header.format(mark), "monday/d15 36kPa 1.mov|5.3|5", "d15 24kPa 1.mp4|3.5|0", "d15_30kPa_1|4.5|20"]

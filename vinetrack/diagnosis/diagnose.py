@@ -20,7 +20,7 @@ from vinetrack.core.records import Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import FAR_BEHIND, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
@@ -230,17 +230,8 @@ def _with_ladder(result: Diagnosis) -> Diagnosis:
     last = result.rounds[-1]
     added = ("", *result.effects, *(step.effect for step in last.partial))
     table = error_ladder((*result.fits, *last.partial_fits), added, len(last.partial))
-    against = not_better(result.effects, table["rms_left_out_m"].tolist()) if result.final_verdict == ADEQUATE else []
+    against = not_better(table) if result.final_verdict == ADEQUATE else []
     return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"], *against))
-
-
-def not_better(added: Sequence[str], errors_m: Sequence[float]) -> list[Remark]:
-    """The effects with which the error on left-out conditions does not fall: that contradicts an adequate model."""
-    return [
-        remark("left_out_error_does_not_fall", name=name, without_m=without_m, with_m=with_m)
-        for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False)
-        if with_m >= without_m
-    ]
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report, ladder: bool, advice: bool) -> Diagnosis:

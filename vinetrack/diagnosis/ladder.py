@@ -487,6 +487,18 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     return table
 
 
+def not_better(table: pd.DataFrame) -> list[Remark]:
+    """The effects of a ladder with which the error on left-out conditions, or on the highest pressure, does not fall:
+    that contradicts an adequate model.
+    """
+    return [
+        remark("left_out_error_does_not_fall", name=name, highest=highest, without_m=without_m, with_m=with_m)
+        for highest, errors_m in ((False, table["rms_left_out_m"]), (True, table["rms_highest_pressure_m"]))
+        for name, without_m, with_m in zip(table["added"][1:], errors_m, errors_m[1:], strict=False)
+        if with_m >= without_m
+    ]
+
+
 def excess(rms_m: float, floor_m: float) -> float:
     """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor."""
     return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan

@@ -372,10 +372,10 @@ class Diagnosis(Printed, Drawn, JsonRecord):
         """The candidates of the first round, best first."""
         return self.rounds[0].ranking if self.rounds else ()
 
-    @property
-    def refutes(self) -> bool:
-        """Whether the initial model lacks physics, so that figures drawn with it must state that."""
-        return self.verdict in (MISSING, AMBIGUOUS, UNEXPLAINED)
+    def refutes(self, model: Sequence[str] = ()) -> bool:
+        """Whether a model that was tested, or else the initial one, lacks physics: what shows it must say so."""
+        verdicts = {frozenset(step.model): step.verdict for step in reversed(self.rounds)}
+        return verdicts.get(frozenset(model or self.initial_model)) in (MISSING, AMBIGUOUS, UNEXPLAINED)
 
     @property
     def pressure_unit(self) -> str:

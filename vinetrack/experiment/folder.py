@@ -133,26 +133,18 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     sheet_is_sound = not (_names_repeat(rows) or any(problem.severity == "error" for problem in problems))
     vines = [row for row in in_use if row.travel_ratio == 2]
     may_be_blank = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
-    blank = {column: [row for row in vines if column not in row.given] for column in may_be_blank}
-    for column in blank:
-        if (stands_for := COLUMNS[column].if_blank) and len(blank[column]) < len(vines):
-            remedy = f"write it in every row, also where it is {COLUMNS[column].default.split(':')[0]}"
-            for row in blank[column]:
-                row.add("partly_blank", f"is blank, unlike others: {stands_for}", column, "warning", remedy=remedy)
-            blank[column] = []  # a note is of what all rows leave blank
+    blank = {column: tuple(row.name for row in vines if column not in row.given) for column in may_be_blank}
+    partly = [name for name, names in blank.items() if COLUMNS[name].if_blank and len(names) < len(vines)]
+    for row in vines:
+        row.add_blank(partly, "the default is taken, where other rows have a value: fill it in, also a 0", "warning")
     for row in in_use:
         if sheet_is_sound and not row.faulty:
             _take_pressure_from_recording(row, folder)
             row.check_pressures()
-    if vines and all(any(problem.code == "no_growth" for problem in row.problems) for row in vines):
-        highest = pressure_text(1e3 * max(row.number("pressure_kPa") for row in vines), vines[0].pressure_unit)
-        message = f"is nowhere above the yield pressure, at most {highest}, so no vine would grow"
-        remedy = "check the units of both and their decimal points: 1 psi is 6.895 kPa, 1 bar is 100 kPa"
-        problems.append(Problem("no_growth", message, "pressure_kPa", file=SHEET, remedy=remedy))
-        sheet_is_sound = False
-        for row in vines:
-            row.problems = [problem for problem in row.problems if problem.code != "no_growth"]
     problems += [problem for row in rows for problem in row.problems]
+    if vines and sum(problem.code == "no_growth" for problem in problems) == len(vines):
+        sheet_is_sound = False  # in one row a trial that may fail, in all one mistake
+        problems = [replace(one, severity="error") if one.code == "no_growth" else one for one in problems]
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.faulty for row in in_use)):
         raise ExperimentError(problems)
@@ -168,7 +160,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
-        blank={column: tuple(row.name for row in without) for column, without in blank.items() if without},
+        blank={column: names for column, names in blank.items() if names and column not in partly},
         columns=table.columns if table else (),
         recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )

@@ -47,7 +47,6 @@ class Column:
     above_low: bool
     slips: tuple[str, ...]
     usual_from: float
-    unusual_hint: str
     allowed_text: str
     shared: bool
     limit: str
@@ -128,22 +127,21 @@ class Column:
         """Return the value unchanged if its column allows it."""
         if self.kind == "choice" and value not in (1, 2):
             raise InputError("is not a travel ratio", code="not_a_choice")
-        if value > self.high:
-            message = f"is above {self.high:g} {self.unit}"
-            raise InputError(message, self._likely_units(value, written_in or self.unit_key), code="above_bounds")
-        if value < self.low or (self.above_low and value == self.low):
-            message = f"{'is not above' if self.above_low else 'is below'} {self.low:g} {self.unit}".strip()
-            raise InputError(message, self._likely_units(value, written_in or self.unit_key), code="below_bounds")
+        if (above := value > self.high) or value < self.low or (self.above_low and value == self.low):
+            code, bound = ("above", self.high) if above else ("below", self.low)
+            message = f"is {'not above' if self.above_low and not above else code} {bound:g} {self.unit}".rstrip()
+            raise InputError(message, self._likely_units(value, written_in), code=f"{code}_bounds")
         return value
 
-    def unusual(self, value: Any) -> str:
+    def unusual(self, value: Any, written_in: str = "") -> str:
         """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""
-        is_unusual = self.kind == "number" and value is not None and value != 0 and value < self.usual_from
-        return f"is unusual: {self.unusual_hint}" if is_unusual else ""
+        if self.kind != "number" or not value or value >= self.usual_from:
+            return ""
+        return f"is unusual: {self._likely_units(value, written_in) or self.measured}"
 
     def _likely_units(self, value: float, written_in: str) -> str:
         """Ask for the units in which the number as it was written would be a usual one of this column."""
-        told, least = [], max(self.low, self.usual_from, 1e-9)
+        told, least, written_in = [], max(self.low, self.usual_from, 1e-9), written_in or self.unit_key
         for key in self.slips:
             typed = convert(value, self.unit_key, written_in)
             if key != written_in and least <= convert(typed, key, self.unit_key) <= self.high:

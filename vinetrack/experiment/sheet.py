@@ -18,7 +18,7 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, parse_number, read_table, safe_join
-from vinetrack.core.units import UNITS, convert, pressure_text
+from vinetrack.core.units import UNITS, convert
 from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
@@ -73,12 +73,12 @@ class Row:
         """Record why the value of a column cannot be used."""
         self.add(error.code, error.message, column, value=value, allowed=error.allowed, remedy=error.remedy)
 
-    def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
+    def add_blank(self, columns: Sequence[str], remedy: str = "fill it in", severity: str = "error") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
         for name in columns:
             if name not in self.given:
-                self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
+                self.add(code, f"is {code}", name, severity, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
     def check(self) -> None:
         """Check the row as a whole: one recording or track, values that agree."""
@@ -130,10 +130,9 @@ class Row:
                 self.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
             return
         if yield_pressure >= pressure:
-            stated = pressure_text(1e3 * pressure, self.pressure_unit, 6)
-            message = f"is not below the pressure of {stated}, so the vine would not grow"
-            message += " (psi? 1 psi is 6.895 kPa)" if self.pressure_unit == "kPa" else ""
-            self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
+            message = "is not below the pressure, so the vine would not grow"
+            remedy = "check the units of both: 1 psi is 6.895 kPa, 1 bar is 100 kPa"
+            self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}", remedy=remedy)
         if pressure > 0 and yield_pressure == 0 and not self.values.get("yield_pressure_sigma_kPa"):
             message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
             remedy = "measure it (raise the pressure until the tip moves), or state yield_pressure_sigma_kPa"
@@ -160,8 +159,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         try:
             if text:
                 row.values[name] = column.read(text, table.decimal, table.units.get(name, ""))
-                if said := column.unusual(row.values[name]):
-                    said = said if typed == text else "is unusual: is the unit in the name of its column right?"
+                if said := column.unusual(row.values[name], table.units.get(name, "")):
                     row.add("unusual", said, name, "warning", value=typed)
             elif name in SHARED and (shared := getattr(settings, name)) is not None:
                 row.values[name] = shared

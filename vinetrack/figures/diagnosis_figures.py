@@ -41,12 +41,12 @@ _ERRORS = {
 
 
 @figure("ladder", "verdict", "The ladder of errors", data="ladder")
-def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
+def draw_ladder(ladder: pd.DataFrame, refuted: bool = False) -> Figure | None:
     """Root mean square error of position of the initial model and with every effect that was added, on a
     logarithmic axis: in sample; on conditions left out of the fit in turn; and on the left-out highest pressure of
     each vine. The band holds the error on conditions left out that an adequate model would show in 95 % of such
-    campaigns, in trials whose pressure and B scatter as replicates do: an error in it does not refute a model, nor
-    prove that nothing is missing.
+    campaigns, in trials whose pressure and B scatter as replicates do: a model within it can be refuted by the shape
+    of its motions.
     """
     if not len(ladder):
         return None
@@ -63,7 +63,7 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         ax.axhline(middle, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
     ax.margins(y=0.15)
     st.plain_log_ticks(ax, "y")
-    labels = ["initial\nmodel"]
+    labels = ["refuted\ninitial model" if refuted or len(ladder) > 1 else "model\nin use"]
     for added, part in list(zip(ladder["added"], ladder["partial"], strict=True))[1:]:
         words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part else "")
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
@@ -76,8 +76,8 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
 @figure("before_after", "verdict", "The worst condition", data="before_after")
 def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Figure | None:
     """The condition that the model in use predicts worst. Above, growth of the leading edge since release: every
-    replicate (dots), the model before (dashed) and with what was added (full). Below, the misfit, measured minus
-    model. Release and origin are fitted for each trial.
+    replicate (dots), that model (dashed) and, where the diagnosis added an effect, the model with it (full). Below,
+    the misfit, measured minus model. Release and origin are fitted for each trial.
     """
     if before_after.empty:
         return None

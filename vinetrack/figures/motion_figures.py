@@ -114,9 +114,9 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
 @figure("model_comparison", "model", "Model and measurement", data="curves")
 def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Position of the leading edge since release, one panel per condition: every replicate (thin lines), the band
-    of one standard deviation around their mean, and the model in use (dashed; full: with the added effects).
-    Release and origin are fitted for each trial; pressure and B are those of the fit. Each panel states the root
-    mean square of model minus measurement, and in brackets its ratio to the replicate scatter.
+    of one standard deviation around their mean, and the model in use (dashed), with effects that the diagnosis
+    added, if any, full. Release and origin are fitted for each trial; pressure and B are those of the fit. Each
+    panel states the root mean square of model minus measurement.
     """
     corner = (0.03, 0.97, "left", "top")  # which the curve of growth leaves empty
     fig, panels = _model_panels(comparison, trajectories, corner, "time since release (ms)", "growth (mm)")
@@ -192,8 +192,7 @@ def _model_panels(
             begun = growth_m >= growth_m[0] + 0.01 * (np.max(growth_m) - growth_m[0])
             first_s = min(0.0, float(np.min(time_s[begun])))
             parts.append(st.thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
-        times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
-        words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
+        words = f"rms {1e3 * row.rms_position_m:.2g} mm\nN = {len(parts)}"
         ax.text(x, y, words, transform=ax.transAxes, color=st.MUTED, ha=ha, va=va, fontsize=font - 1.5)
         longest = max(parts, key=lambda part: float(part["time_s"].iloc[-1]))
         panels.append((ax, parts, longest, styles[row.vine].colour))

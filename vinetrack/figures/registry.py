@@ -134,7 +134,7 @@ class FigureTables:
         """`comparison.csv` with vines and labels; a refuted model says so in its name."""
         compared = label_conditions(read_result(self.results.comparison), self.trials)
         diagnosis = read_diagnosis(self.results)
-        if diagnosis is not None and diagnosis.refutes:
+        if diagnosis is not None and diagnosis.refutes():
             compared = compared.assign(model="refuted initial model: " + compared["model"])
         return compared
 

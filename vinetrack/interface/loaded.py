@@ -282,6 +282,8 @@ def read_source(
     """
     if isinstance(source, LoadedResults):
         source = source.folder
+    if isinstance(source, FitSummary):
+        raise ResultsError("a fit that was loaded holds no trials: pass the results that it came from, r for r.fit")
     if isinstance(source, pd.DataFrame):
         return tracks_from_frame(source), None, {}
     if isinstance(source, (str, Path)) and tracks is None and (Path(source) / PROVENANCE).exists():

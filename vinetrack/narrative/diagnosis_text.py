@@ -12,6 +12,7 @@ from vinetrack.core import units
 from vinetrack.core.problems import joined
 from vinetrack.core.terminal import table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
+from vinetrack.diagnosis.ladder import not_better
 from vinetrack.diagnosis.result import EXPECTED, NOT_TESTABLE, Diagnosis, Round
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.inference.fit_result import DAMPING
@@ -291,11 +292,8 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     was, now = ({(one.title, one.shown[0]): value_text(one) for one in fit.numbers} for fit in (before, after))
     body = [(title, was.get((title, unit), "–"), now.get((title, unit), "–"), unit) for title, unit in was | now]
     lines += table(body, ("", "before", "after", "unit"), align="<>><")
-    errors = ladder["rms_left_out_m"].tolist()
-    if errors[-1] >= errors[0] and gain > 9.0:
-        facts = {"name": name, "without_m": errors[0], "with_m": errors[-1]}
-        lines.append(f"! {sentence('left_out_error_does_not_fall', facts)}")
-    return lines + [f"! {message}" for message in after.messages]
+    against = not_better(ladder) if gain > 9.0 else []
+    return lines + [f"! {message}" for message in (*against, *after.messages)]
 
 
 def _newtons(amplitude_N: float, sigma_N: float) -> str:

@@ -80,7 +80,8 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
 # What would make the part of an error smaller that all trials share, by its source
 SHARED_REMEDIES = {
     "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
-    "tracking": "film the edge larger or sharper", "lens": "calibrate the lens with a board",
+    "tracking": "film the edge larger or sharper",
+    "lens": "film a ruler along the growth, and state how uneven its marks are (position_systematic_mm)",
 }  # fmt: skip
 
 
@@ -128,7 +129,10 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
         verdict = DROPPED_FRAMES
     elif verdict == ARTEFACT and trials_differ(answers):
         verdict, names = "only_trials_differ", list(map(difference_text, answers))
-    return sentence(verdict or "no_verdict", {"names": names})
+    added = [name for name in diagnosis.initial_model if name not in BASE_EFFECTS]
+    sizes = {name: sizes_in_words([p for p in diagnosis.parameters if p.key.split(".")[0] == name]) for name in added}
+    told = joined([f"{shown(name)} ({size})" if size else shown(name) for name, size in sizes.items()])
+    return sentence(verdict or "no_verdict", {"names": names, "added": told})
 
 
 def verdict_table(diagnosis: Diagnosis) -> list[Row]:
@@ -390,7 +394,7 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     for rival in alike:
         unit, times = display_unit(rival.unit, size.pressure_unit)
         limit = f"{number(rival.limit * times, 2)} {unit}".rstrip()
-        names.append(f"{spaced_name(rival.effect)} ({rival.symbol} up to {limit})")
+        names.append(f"{spaced_name(rival.effect)} ({rival.symbol} as far as {limit})")
     return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 

@@ -182,6 +182,8 @@ def with_shared(text: str, values: Mapping[str, str]) -> str:
                 line = re.compile(rf"^{re.escape(other)}(\s*:)(.*\n?)", re.MULTILINE)
                 text = line.sub("" if key in content else rf"{key}\1\2", text, count=1)
                 content.setdefault(key, content[other])
+        with suppress(InputError):  # no unit stands below a name with another
+            cell = in_unit_of(key, key, cell.strip())
         value, present = _value(cell), content.get(key)
         if value != present and (None in (value, present) or str(value) != str(present)):
             text = with_value(text, key, value, SETTINGS)
@@ -398,6 +400,7 @@ def _header_words(columns: Sequence[str]) -> dict[str, str]:
     for name in (*COLUMNS, *columns):
         words |= {written.lower(): written for written in (*other_units(name), name)} | {quantity(name).lower(): name}
     short = {"film": "thickness", "wall": "thickness", "p": "pressure", "dia": "diameter", "l": "length"}
+    short |= {"load": "payload"}
     words |= {
         word.replace(name, other, 1): column
         for other, name in short.items()

@@ -64,27 +64,6 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 # Numbers and words of the text panels, which `panels.html` lays out.
 
 
-def headline(
-    campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
-) -> str:
-    """Return the error of the model now and as the page opened, beside that of an adequate model, as a heading."""
-    now, before = ("" if one is None else _in_mm(one.rms_m) for one in (prediction, opened_with))
-    errors_m = {} if prediction is None else prediction.errors_m
-    highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
-    words = model_text(choice.effects)
-    return panel(
-        "headline",
-        model=words[:1].upper() + words[1:],
-        now=now,
-        before=before,
-        beyond=beyond_adequate(errors_m.values(), highest_m),
-        refused=campaign.stored.refused,
-        named=model_text(campaign.experiment.settings.model),
-        in_use=model_text(campaign.in_use),
-        command=command_for_results(campaign.experiment.folder, campaign.folder),
-    )
-
-
 def _in_mm(value_m: float) -> str:
     return f"{number(1e3 * value_m)} mm" if math.isfinite(value_m) else ""
 
@@ -482,7 +461,7 @@ class Page:
         """Update all text of the page."""
         if self._job is None:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
-            set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
+            set_text(self.headline, self._headline())
         compared = []
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference)
@@ -497,6 +476,25 @@ class Page:
         command = shlex.join(["vinetrack", "diagnose", self.campaign.folder.as_posix()])
         set_text(self.verdict, panel("verdict", diagnosis=diagnosis, diagnose=command, rows=rows))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
+
+    def _headline(self) -> str:
+        """The error of the model now and as the page opened, beside that of an adequate model, as a heading."""
+        campaign, shown, words = self.campaign, self.shown, model_text(self.choice.effects)
+        errors_m = {} if shown is None else shown.errors_m
+        highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
+        refuted = self.diagnosis is not None and self.diagnosis.refutes(self.choice.effects)
+        now, before = ("" if one is None else _in_mm(one.rms_m) for one in (shown, self.background.prediction))
+        return panel(
+            "headline",
+            model=words[:1].upper() + words[1:],
+            now=now,
+            before=before,
+            beyond=beyond_adequate(errors_m.values(), highest_m, refuted),
+            refused=campaign.stored.refused,
+            named=model_text(campaign.experiment.settings.model),
+            in_use=model_text(campaign.in_use),
+            command=command_for_results(campaign.experiment.folder, campaign.folder),
+        )
 
     def _update_status(self) -> None:
         """Update the status line."""

@@ -377,13 +377,14 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 # The section of the report that compares the model in use with the measurement.
 
 
-def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float]) -> str:
-    """In how many conditions the error is above the most of an adequate model, as the end of a sentence."""
+def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float], refuted: bool) -> str:
+    """In how many conditions the error exceeds the most of an adequate model, and whether the model is refuted."""
     known = [rms > high for rms, high in zip(rms_m, high_m, strict=True) if math.isfinite(high)]
-    return f"; in {sum(known)} of {len(known)} conditions more than an adequate model would be" if known else ""
+    told = f"; in {sum(known)} of {len(known)} conditions more than an adequate model would be" if known else ""
+    return told + ("; the diagnosis refutes this model, by the shape of the motions" if refuted else "")
 
 
-def model_errors(table: pd.DataFrame) -> str:
+def model_errors(table: pd.DataFrame, refuted: bool = False) -> str:
     """The position error of the model in two sentences, from `comparison.csv` with the numbers of trials; blank without
     a condition.
     """
@@ -392,7 +393,7 @@ def model_errors(table: pd.DataFrame) -> str:
     worst = table.sort_values("rms_position_m").iloc[-1]
     conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
     rms_m = math.sqrt(np.average(table["rms_position_m"] ** 2, weights=table["n_trials"]))
-    beyond = beyond_adequate(table["rms_position_m"], table["expected_high_m"])
+    beyond = beyond_adequate(table["rms_position_m"], table["expected_high_m"], refuted)
     return (
         f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square){beyond}. "
         f"Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum after "

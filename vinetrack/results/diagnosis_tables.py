@@ -41,6 +41,7 @@ class DiagnosisTables:
         self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
         self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
         self.ladder = none if (ladder := diagnosis and diagnosis.ladder) is None else found.get("steps.csv", ladder)
+        self.refuted = bool(diagnosis and diagnosis.refutes())
         self.added = listed_names(diagnosis.effects if diagnosis else ())
         self.pressure_unit = diagnosis.pressure_unit if diagnosis else "kPa"
         self.drift = found.get("drift_groups.csv", none)

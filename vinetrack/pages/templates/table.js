@@ -9,7 +9,7 @@ export function drawTable() {
   table.onkeydown = move;
   $("notes").replaceChildren(el("option", {value: ""}, "…"), ...state.notes.map((name) => el("option", {value: name}, name)));
   $("notes").parentElement.hidden = !state.notes.length;
-  $("notes").onchange = (event) => propose({file: event.target.value}, "trial", 0);
+  $("notes").onchange = ({target}) => { propose({file: target.value}, "trial", 0); target.value = ""; }; // to be read again
   $("traces").replaceChildren(...state.traces.map((name) => el("option", {value: name})));
   drawAdder(columns);
   markProblems();
