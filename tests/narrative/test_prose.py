@@ -26,7 +26,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import templates
-from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines, table_lines
+from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines
 from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict_line, verdict_sentence, verdict_table
 
 PACKAGE = Path(vinetrack.__file__).parent
@@ -109,12 +109,6 @@ def plan() -> str:
     first = remark("measure_first", faults=["length_scale", "time_base"], measurement=remark(""))
     further = [line for one in (none, enough, never) for line in further_lines(one)]
     return "\n".join([*further, *map(str, [*made, first])])
-
-
-def test_the_last_lines_of_a_run_begin_with_how_sure_the_verdict_is():
-    told = Diagnosis.from_json(diagnosis("missing"))
-    for in_short in (False, True):
-        assert table_lines(told, in_short=in_short)[0].strip().startswith("How sure") == in_short
 
 
 def test_a_refuted_model_is_known_and_an_extended_adequate_one_is_told_by_what_was_added():

@@ -98,10 +98,9 @@ def test_shared_values_are_set_in_place_and_in_the_unit_chosen():
     assert "yield_pressure_kPa" not in parse_yaml(after, "").content
     both = draft.with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
     assert parse_yaml(both, "").content == {"yield_pressure_psi": 0.42}
-    for typed, kPa in (("3", 3), ("0.035 bar", 3.5), ("5 furlong", "5 furlong")):
-        assert (
-            parse_yaml(draft.with_shared(after, {"yield_pressure_kPa": typed}), "").content["yield_pressure_kPa"] == kPa
-        )
+    for typed, kPa in (("3", 3), ("0.035 bar", 3.5)):
+        kept = parse_yaml(draft.with_shared(after, {"yield_pressure_kPa": typed}), "").content
+        assert kept["yield_pressure_kPa"] == kPa
 
 
 COLUMNS = ["capture_fps", "diameter_mm", "pressure_kPa", "payload_g"]

@@ -136,7 +136,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     blank = {column: tuple(row.name for row in vines if column not in row.given) for column in may_be_blank}
     partly = [name for name, names in blank.items() if COLUMNS[name].if_blank and len(names) < len(vines)]
     for row in vines:
-        row.add_blank(partly, "the default is taken, where other rows have a value: fill it in, also a 0", "warning")
+        row.add_blank(partly, "others have a value, so fill it in, 0 as well", "warning")
     for row in in_use:
         if sheet_is_sound and not row.faulty:
             _take_pressure_from_recording(row, folder)

@@ -137,7 +137,7 @@ class Column:
         """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""
         if self.kind != "number" or not value or value >= self.usual_from:
             return ""
-        return f"is unusual: {self._likely_units(value, written_in) or self.measured}"
+        return f"is unusual, below {self.usual_from:g}: {self._likely_units(value, written_in) or self.meaning}"
 
     def _likely_units(self, value: float, written_in: str) -> str:
         """Ask for the units in which the number as it was written would be a usual one of this column."""

@@ -18,7 +18,7 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, parse_number, read_table, safe_join
-from vinetrack.core.units import UNITS, convert
+from vinetrack.core.units import UNITS, convert, pressure_text
 from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
@@ -78,7 +78,8 @@ class Row:
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
         for name in columns:
             if name not in self.given:
-                self.add(code, f"is {code}", name, severity, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
+                told = f"{COLUMNS[name].if_blank}; {remedy}".lstrip("; ")
+                self.add(code, f"is {code}", name, severity, value="", allowed=COLUMNS[name].allowed, remedy=told)
 
     def check(self) -> None:
         """Check the row as a whole: one recording or track, values that agree."""
@@ -130,9 +131,9 @@ class Row:
                 self.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
             return
         if yield_pressure >= pressure:
-            message = "is not below the pressure, so the vine would not grow"
-            remedy = "check the units of both: 1 psi is 6.895 kPa, 1 bar is 100 kPa"
-            self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}", remedy=remedy)
+            message = "is not below the pressure, nothing would grow: check both units (1 bar is 100 kPa, 1 psi 6.895)"
+            value = pressure_text(1e3 * yield_pressure, self.pressure_unit)
+            self.add("no_growth", message, "yield_pressure_kPa", "warning", value=value)
         if pressure > 0 and yield_pressure == 0 and not self.values.get("yield_pressure_sigma_kPa"):
             message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
             remedy = "measure it (raise the pressure until the tip moves), or state yield_pressure_sigma_kPa"

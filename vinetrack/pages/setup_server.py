@@ -310,7 +310,8 @@ def draft_problems(folder: Path, draft: files.Draft, thorough: bool = False) -> 
     """
     with files.draft_folder(folder, draft) as copy:
         checked = check_folder(copy) if thorough else None
-        problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
+        problems = [*(check_experiment(copy) if checked is None else checked.problems)]
+    problems += _scale_missing(draft) if "calibration" not in {problem.column for problem in problems} else []
     # What is noted, such as a unit, was chosen on the page.
     told = [_problem_json(one, draft.sheet.columns) for one in problems if one.severity != "note"]
     return {
