@@ -52,7 +52,7 @@ def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_shar
     done = run("check", one_vine(tmp_path / "v", rows))
     assert done.exit_code == 1
     assert all(word in done.output for word in ("trials.csv", "t0 and 199 more", "pressure_kPa", "9999"))
-    assert len(done.output.splitlines()) == 5  # with a line for each of four blank columns
+    assert len(done.output.splitlines()) == 6  # with a line for each of five blank columns
 
 
 def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):

@@ -145,7 +145,7 @@ class Column:
         for key in self.slips:
             typed = convert(value, self.unit_key, written_in)
             if key != written_in and least <= convert(typed, key, self.unit_key) <= self.high:
-                meant = f"{convert(typed, key, written_in):.3g} {UNITS[written_in].text}"
+                meant = f"{convert(typed, key, written_in):.4g} {UNITS[written_in].text}"
                 told.append(f"{typed:g} {UNITS[key].text} ({meant})")
         return f"is it {joined(told, 'or')}?" if told else ""
 
