@@ -191,6 +191,7 @@ def _propose(results: Path, experiment: Path | None, report: Say) -> Answer:
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
     from vinetrack.diagnosis.ladder import comparison_lines
+    from vinetrack.narrative.verdict_text import verdict_line
     from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 
     fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
@@ -199,7 +200,8 @@ def _compare(results: Path) -> Answer:
         return [str(diagnosis), "", *comparison_lines(compared)], content
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"], content
-    return [*comparison_lines(compared), *(f"! {message}" for message in fit.messages)], content
+    told = [verdict_line(diagnosis)] if diagnosis is not None and diagnosis.refutes() else []
+    return [*comparison_lines(compared), *(f"! {message}" for message in (*told, *fit.messages))], content
 
 
 @command()

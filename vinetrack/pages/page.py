@@ -479,17 +479,16 @@ class Page:
 
     def _headline(self) -> str:
         """The error of the model now and as the page opened, beside that of an adequate model, as a heading."""
-        campaign, shown, words = self.campaign, self.shown, model_text(self.choice.effects)
+        campaign, shown, known, effects = self.campaign, self.shown, self.diagnosis, self.choice.effects
         errors_m = {} if shown is None else shown.errors_m
         highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
-        refuted = self.diagnosis is not None and self.diagnosis.refutes(self.choice.effects)
         now, before = ("" if one is None else _in_mm(one.rms_m) for one in (shown, self.background.prediction))
         return panel(
             "headline",
-            model=words[:1].upper() + words[1:],
+            model=model_text(effects).capitalize(),
             now=now,
             before=before,
-            beyond=beyond_adequate(errors_m.values(), highest_m, refuted),
+            beyond=beyond_adequate(errors_m.values(), highest_m, bool(known and known.refutes(effects))),
             refused=campaign.stored.refused,
             named=model_text(campaign.experiment.settings.model),
             in_use=model_text(campaign.in_use),
