@@ -25,10 +25,9 @@ from vinetrack.video import edge, track
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import Look, cut_strip
-from vinetrack.video.track import Tracking, follow, track_recording
+from vinetrack.video.strip import Look, calibrated_sigma, cut_strip
+from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, moving_range, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
 

@@ -19,8 +19,14 @@ import numpy as np
 from vinetrack.core.records import Bools, Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX, SMALLEST_POINT_SPACING_PX
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.kymograph import collecting_path
-from vinetrack.video.small_pictures import Pixels, SmallPictures, busy_pictures, changed_pixels, order_tolerance
+from vinetrack.video.small_pictures import (
+    Pixels,
+    SmallPictures,
+    busy_pictures,
+    changed_pixels,
+    collecting_path,
+    order_tolerance,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

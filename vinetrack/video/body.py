@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats
 from vinetrack.tracks.position_noise import rough_noise, turning_point
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.kymograph import dividing_path
-from vinetrack.video.point_quality import calibrated_sigma
-from vinetrack.video.small_pictures import busy_frames
-from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, cut_strip
+from vinetrack.video.small_pictures import busy_frames, dividing_path
+from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, calibrated_sigma, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
 LEAST_MATCH = 0.6  # Correlation with the template below which the patch found is not the body (chosen)

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video import kymograph as ky
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, front_share
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import calibrated_sigma
-from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import Look, Positions, Strip, Tracker, cut_strip, snap_to_grid
+from vinetrack.video.small_pictures import END_FRAMES, SmallPictures, column_after_leap, dividing_path
+from vinetrack.video.strip import Look, Positions, Strip, Tracker, calibrated_sigma, cut_strip, snap_to_grid
 
 # ------------------------------------------------------------------------------
 # State of the tracker and the steps of its alternation: estimate film and background, then fit the edge.
@@ -463,8 +461,8 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     film and background for a straight tip and a typical blur; and the first column of those that changed in runs, and
     the one behind the last. A late beginning is better than an early one: neighbours then stand in for the background.
     """
-    ends = slice(-ky.END_FRAMES, None), slice(0, ky.END_FRAMES)
-    last, first = (np.sort(strip.brightness(frames), axis=0)[ky.END_FRAMES // 2] for frames in ends)
+    ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
+    last, first = (np.sort(strip.brightness(frames), axis=0)[END_FRAMES // 2] for frames in ends)
     # Power of each column's change, of rows averaged in groups, over that of the noise
     # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
     group_size = int(np.clip(len(first) // 12, 1, 4))
@@ -474,14 +472,14 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
     votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, weight)
-    path = ky.dividing_path(votes)
+    path = dividing_path(votes)
     # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
     # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
     run = np.convolve(power > 70.0, np.ones(9) / 9, mode="same") > 0.6
     if run.sum() < 9:
         raise ValueError("nothing moves along the axis")
     changed_columns = np.flatnonzero(run & (power > 70.0))
-    passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
+    passed = max(int(changed_columns[0]), column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
     return straight_tip(strip, _with_run_up(np.clip(path, *passed))), passed
@@ -696,7 +694,7 @@ def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], passed: t
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width)
     # 25, 2: columns behind the first passed one, and ahead of the last, up to which it may lie (chosen)
-    return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
+    return np.clip(dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
 
 
 BANDS_ERROR = 0.9  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)

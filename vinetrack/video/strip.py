@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
+from vinetrack.tracks.position_noise import FOURTH_DIFFERENCE
 from vinetrack.video.axis import Axis, axis_through
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -93,6 +94,23 @@ class Tracker(Protocol):
     def follow(self, look: Look) -> Positions | None:
         """Positions by frame; None where something moves that is another tracker's."""
         ...
+
+
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats) -> Floats:
+    """Scale the stated errors to the roughness of the track in motion. Fourth differences cancel any cubic motion and
+    have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard
+    deviation; it stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px (n_frames,) → (n_frames,).
+    """
+    windows = np.lib.stride_tricks.sliding_window_view
+    difference = windows(edge_px, 5) @ FOURTH_DIFFERENCE
+    expected = np.sqrt(windows(sigma_px**2, 5) @ FOURTH_DIFFERENCE**2)
+    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
+    use = (np.gradient(edge_px) > 0.3) & np.isfinite(edge_px)
+    inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
+    if inside.sum() < 8:
+        return sigma_px
+    factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
+    return sigma_px * float(np.clip(factor, 0.5, 6.0))  # 0.5, 6.0: least and largest factor (chosen)
 
 
 def cut_strip(
