@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from vinetrack.core.problems import Remark, confirmed, remark
-from vinetrack.core.records import Floats, Indices, Track, Trial, with_flag
+from vinetrack.core.records import Floats, Track, Trial, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
@@ -41,15 +41,6 @@ class _Jump(NamedTuple):
     size: float
     sigma: float
     step: float
-
-
-@dataclass(frozen=True)
-class _Fault:
-    """A fault on the way to row `row`: a frame repeated (stale or inserted) or `missing` frames dropped."""
-
-    kind: str
-    row: int
-    missing: int = 0
 
 
 def correct_frames(track: Track) -> Track:
@@ -74,10 +65,19 @@ def _correct_timing(track: Track) -> Track:
         note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
         out = out.flagged([int(before) + 1], "gap", note)
     noise_m, rho = _noise(out)
-    checked_to = 0
-    while (fault := _next_fault(out, checked_to, step_s, noise_m, rho)) is not None:
-        out = _correct_fault(out, fault, step_s)
-        checked_to = fault.row
+    row = 0
+    while (fault := _next_fault(out, row, step_s, noise_m, rho)) is not None:
+        row, frames_late, is_copy = fault
+        at_s, time_s = float(out.time_s[row]), out.time_s.copy()
+        time_s[row] += (frames_late / 2 if is_copy else frames_late) * step_s
+        time_s[row + 1 :] += frames_late * step_s
+        if is_copy:
+            note = f"the frame at {at_s:.5g} s repeats the one before it and is left out"
+            note += ", later times moved back by one frame" if frames_late else ""
+        else:
+            note = f"{_frames_are(frames_late)} missing before {at_s:.5g} s (the step there is too long): later times "
+            note += "moved on"
+        out = replace(out, time_s=time_s).flagged([row], "duplicate" if is_copy else "gap;retimed", note)
     return out
 
 
@@ -119,8 +119,10 @@ def _frames_are(frames: int) -> str:
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
-def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Fault | None:
-    """The first fault on a row beyond `after`."""
+def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> tuple[int, int, bool] | None:
+    """The first fault on a row beyond `after`: that row, by how many frames the times from there on are early, and
+    whether it repeats the row before.
+    """
     import pandas as pd
 
     rows = np.flatnonzero(track.usable)
@@ -142,20 +144,20 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))).tolist():
         if rows[i + 1] <= after:
             continue
-        if (fault := _fault_at(frame, y, i, noise_m[i], rho, rows)) is not None:
-            return fault
+        if (fault := _fault_at(frame, y, i, noise_m[i], rho)) is not None:
+            return int(rows[i + 1]), *fault
     return None
 
 
-def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
-    """What happened between points i and i + 1: frames are missing, or the second repeats the first, and replaced a
-    frame or was inserted; None where nothing is sure.
+def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float) -> tuple[int, bool] | None:
+    """What happened between points i and i + 1: so many frames are missing, or the second repeats the first, and
+    replaced a frame (0) or was inserted (−1); None where nothing is sure.
     """
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is not None and frame[i + 1] - frame[i] == 1:
         missing, is_long = round(jump.size / jump.step), y[i + 1] - y[i] > DROP_RATIO * jump.step
         if missing >= 1 and is_long and jump.size >= JUMP_SIGMAS * jump.sigma:
-            return _Fault("dropped", int(rows[i + 1]), missing)
+            return missing, False
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None:
         return None
@@ -170,12 +172,12 @@ def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows
         size, sigma = float(y[i + 2] - y[i] - (y[i] - y[i - 1]) - (y[i + 3] - y[i + 2])), 2 * step_sigma
     allowed = max(3 * sigma, 0.3 * step)
     if abs(size) <= allowed:
-        return _Fault("stale", int(rows[i + 1]))
+        return 0, True
     without = np.delete(frame, i + 1), np.delete(y, i + 1)
     # The step back after an inserted copy must be significant, and points farther away must not deny it.
     is_back = abs(size + step) <= allowed and -size > 3.5 * sigma
     if is_back and not -_wide_jump(*without, i, noise_m) < LEAST_SHARE * step:
-        return _Fault("inserted", int(rows[i + 1]))
+        return -1, True
     return None
 
 
@@ -225,24 +227,6 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float) -> float:
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
     return float(fit[4]) if misfit_m < 2.5 * noise_m else math.nan
-
-
-def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
-    """The track with one fault flagged and reported, and its times corrected."""
-    at_s, time_s = float(track.time_s[fault.row]), track.time_s.copy()
-    if fault.kind == "stale":
-        note = f"the frame at {at_s:.5g} s repeats the one before it and is left out"
-        return track.flagged([fault.row], "duplicate", note)
-    if fault.kind == "inserted":
-        time_s[fault.row] -= step_s / 2
-        time_s[fault.row + 1 :] -= step_s
-        note = f"the frame at {at_s:.5g} s is an inserted copy: left out, later times moved back by one frame"
-        return replace(track, time_s=time_s).flagged([fault.row], "duplicate", note)
-    time_s[fault.row :] += fault.missing * step_s
-    note = (
-        f"{_frames_are(fault.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
-    )
-    return replace(track, time_s=time_s).flagged([fault.row], "gap;retimed", note)
 
 
 def mean_speed(track: Track) -> float:
