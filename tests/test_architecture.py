@@ -41,7 +41,7 @@ BUDGETS = {
     "paper": (891, 4, 35),
     "pipeline": (1982, 7, 6),
     "planning": (1583, 4, 24),
-    "report": (746, 3, 4),
+    "report": (793, 3, 4),
     "results": (475, 4, 9),
     "tracks": (1482, 4, 19),
     "video": (4991, 13, 74),

@@ -25,10 +25,10 @@ from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.report import clips
+from vinetrack.report.clips import write_clip
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import NO_GROWTH, Tracking
-from vinetrack.video.write import write_clip
 
 SHEET: dict[str, object] = {
     "capture_fps": 1000, "diameter_mm": 13.2, "thickness_um": 100, "length_mm": 190, "pressure_kPa": 30,

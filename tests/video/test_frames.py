@@ -22,6 +22,7 @@ from vinetrack.laboratory.filming import Filming, film
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
+from vinetrack.report.clips import write_clip
 from vinetrack.video import frames as module
 from vinetrack.video import small_pictures
 from vinetrack.video.axis import Axis
@@ -38,7 +39,6 @@ from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.strip import Strip, camera_unit
 from vinetrack.video.track import track_frames, track_recording
-from vinetrack.video.write import write_clip
 
 RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from fractions import Fraction
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +24,6 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 from vinetrack.video.axis import Axis, axis_entry, axis_from_entry
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.survey import Measurement
-from vinetrack.video.write import write_clip
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -202,3 +203,41 @@ def recording_facts(measured: Measurement, rate: float, mm_per_px: float) -> dic
         "edge_sigma_px": float(np.nanmedian(sigma_px)) if np.isfinite(sigma_px).any() else math.nan,
         "notes": list(track.notes),
     }
+
+
+def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float) -> int:
+    """Write RGB pictures of shape (height, width, 3), all of one size and with even sides, as H.264 in MP4 with its
+    index in front, which any player, browser and slide plays; the whole clip or nothing. Returns their number.
+    """
+    import av
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".part-{path.name}")
+    count, stream = 0, None
+    try:
+        with av.open(str(draft), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+            for count, picture in enumerate(pictures, 1):
+                if stream is None:
+                    height, width = picture.shape[:2]
+                    if height % 2 or width % 2:
+                        raise ValueError(f"a clip needs pictures of even sides, not {width} × {height}")
+                    stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
+                    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                    # Without mbtree=0 the same pictures are encoded to different bytes (measured).
+                    options = {"preset": "superfast", "crf": "26", "profile": "high", "tune": "animation"}
+                    stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
+                    context.thread_count = 1
+                    context.colorspace = context.color_primaries = context.color_trc = 6  # BT.601, as OpenCV converts
+                planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
+                frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+                frame.pts = count - 1
+                container.mux(stream.encode(frame))
+            if stream is None:
+                raise ValueError("there is no picture to make a clip of")
+            container.mux(stream.encode())
+        draft.replace(path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            draft.unlink()
+    return count
