@@ -26,7 +26,7 @@ from vinetrack.report.clips import write_clip
 from vinetrack.video import frames as module
 from vinetrack.video import small_pictures
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge import outline
+from vinetrack.video.edge import axis_of_tube, outline
 from vinetrack.video.frames import (
     PHANTOM_TABLE,
     Frames,
@@ -528,8 +528,8 @@ def test_a_tube_of_two_widths_has_one_of_them():
     for i in range(n):
         values[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & inside)
     luma, axis = np.clip(values, 0, 255).astype(np.uint8), Axis((0, 40), (columns - 1, 40), 40)
-    sides = outline(Strip(luma, np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False))
-    assert np.isfinite([sides.shift_px, sides.slope, sides.width_px]).all()
+    sides = outline(Strip(luma, np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False), 12)
+    assert np.isfinite([sides.width_px, *axis_of_tube(axis, sides)[0].to_px]).all()
 
 
 GIVEN_UP = """

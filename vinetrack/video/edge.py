@@ -561,12 +561,10 @@ class EdgeTracker(Tracker):
 
 @dataclass(frozen=True)
 class Outline:
-    """Outline of the tube that the front leaves behind: its centreline and width, px. `shift_px` and `slope` (px per
-    px) describe the centreline across the strip.
+    """Outline of the tube that the front leaves behind, px: its width, and where its middle lies across the strip,
+    `middles_px`, at `places_px` along it.
     """
 
-    shift_px: float
-    slope: float
     half_px: float
     width_px: float
     width_sigma_px: float
@@ -576,7 +574,7 @@ class Outline:
     middles_px: Floats
 
 
-def outline(strip: Strip, parts: int = 12) -> Outline:
+def outline(strip: Strip, parts: int) -> Outline:
     """Measure the centreline and width of the tube that the front leaves behind. The contrast of each row between film
     and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
     degrees off and would cut the tube obliquely.
@@ -584,29 +582,23 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     state, passed = initial_front_path(strip)
     film, background = state.appearance[:2, :, passed[0] : passed[1]]
     power = (film - background).astype(float) ** 2
-    rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
         profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
-        low, high = _max_sum_run(profile - max(0.4 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
-        sides.append((rows[0] + low, rows[0] + high))
         contrasts.append(float(np.quantile(profile, 0.75)))
+        sides.append(_max_sum_run(profile - max(0.4 * contrasts[-1], 0.25 * float(profile.max()))))
         places.append(passed[0] + float(piece.mean()))
-    side, place = np.array(sides), np.array(places)
+    side, place = np.array(sides) - (len(power) - 1) / 2, np.array(places)
     width = side[:, 1] - side[:, 0]
     typical = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
-    place, centre = place[typical], side[typical].mean(axis=1)
-    i, j = np.triu_indices(len(place), 1)  # a line by the median of pairwise slopes (Theil-Sen)
-    slope = float(np.median((centre[j] - centre[i]) / (place[j] - place[i]))) if len(i) else 0.0
-    intercept = float(np.median(centre - slope * place))
     median_width = float(np.median(width))
     width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
     # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
     faint = 0.15 * median_width if float(np.median(contrasts)) < 25.0 else 0.0
     # 1.0: error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
-    sigma = float(np.linalg.norm([width_error, 1.0, faint]))
-    return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, state, passed, place, centre)
+    sigma, middles = float(np.linalg.norm([width_error, 1.0, faint])), side[typical].mean(axis=1)
+    return Outline(median_width / 2 + 1.5, median_width, sigma, state, passed, place[typical], middles)
 
 
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
@@ -630,10 +622,6 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
 # Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
 
 
-STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-CENTRED_PX = 1.0  # Largest distance from the tube's middle at which its outline is right (chosen)
-
-
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
     An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
@@ -642,13 +630,15 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
     strip = cut_strip(luma, axis, 0.65 * axis.width_px + 3, nearest=True)
-    parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
+    # 30.0: length of the stretches in which the tube's middle is found along a curve (chosen)
+    parts = max(12, round(axis.length_px / 30.0)) if axis.bends else 12
     tube = outline(strip, parts)
     try:
         moved, distance_px = axis_of_tube(strip.axis, tube)
         # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
         for _ in range(3):
-            if distance_px < CENTRED_PX and tube.half_px + 2 * CENTRED_PX < strip.values.shape[1] / 2:
+            # 1.0, 2.0: distances from the tube's middle, and to its sides, from which its outline is right (chosen)
+            if distance_px < 1.0 and tube.half_px + 2.0 < strip.values.shape[1] / 2:
                 break
             strip = cut_strip(luma, moved, tube.half_px * 1.15 + 5, strip, nearest=True)
             tube = outline(strip, parts)
@@ -664,25 +654,28 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
 
 def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
     """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
-    keep their places along it: only the position across is corrected. A curve stays as it is where the tube's middle
-    makes none that a strip can be cut along.
+    keep their places along it: only the position across is corrected. It stays as it is where the tube's middle is no
+    path that a strip can be cut along.
     """
-    if not axis.bends:
-        ends_px = np.array([0.0, axis.length_px])
-        offsets = tube.shift_px + tube.slope * ends_px
-        return axis_through(axis.points(ends_px, offsets), 2 * tube.half_px), float(np.abs(offsets).max())
-    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
-    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    offsets = np.interp(knots, tube.places_px, tube.middles_px)
+    place, middle = tube.places_px, tube.middles_px
+    if axis.bends:
+        # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+        knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
+        offsets = np.interp(knots, place, middle)
+    else:  # a line by the median of pairwise slopes (Theil-Sen)
+        i, j = np.triu_indices(len(place), 1)
+        slope = float(np.median((middle[j] - middle[i]) / (place[j] - place[i]))) if len(i) else 0.0
+        knots = np.array([0.0, axis.length_px])
+        offsets = float(np.median(middle - slope * place)) + slope * knots
     through = axis.points(knots, offsets)
     separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
     try:
-        curve = axis_through(through[np.append(True, separate)], 2 * tube.half_px)
+        moved = axis_through(through[np.append(True, separate)], 2 * tube.half_px)
     except RecordingError:
         return axis, 0.0
-    if not curve.bends or tube.half_px > curve.largest_half_px:
+    if moved.bends is not axis.bends or tube.half_px > moved.largest_half_px:
         return axis, 0.0
-    return curve, float(np.abs(offsets).max())
+    return moved, float(np.abs(offsets).max())
 
 
 def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int]) -> Floats:

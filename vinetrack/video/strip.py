@@ -44,13 +44,6 @@ class Strip:
         scale, offset = (of_frame[frames, None, None].astype(np.float32) for of_frame in (self.scale, self.offset))
         return np.asarray(self.values[frames] * scale + offset)
 
-    def shake_along(self, edge_px: Floats) -> Floats:
-        """How far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →
-        (n_frames,).
-        """
-        place_px = np.where(np.isfinite(edge_px), edge_px, 0.5 * self.axis.length_px)
-        return np.asarray(np.sum(self.shift_px * self.axis.direction_at(place_px), axis=1))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Positions:

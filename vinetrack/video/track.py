@@ -327,7 +327,8 @@ def track_pixels(
     mean = strip.values.mean(axis=1, dtype=np.float32) * strip.scale[:, None] + strip.offset[:, None]
     kymograph = np.clip(np.rint(mean), 0, 255).astype(np.uint8)
     shake_px = np.zeros(len(frames.slots))
-    shake_px[number] = strip.shake_along(followed.edge_px)
+    seen_px = np.where(np.isfinite(followed.edge_px), followed.edge_px, 0.5 * strip.axis.length_px)
+    shake_px[number] = np.sum(strip.shift_px * strip.axis.direction_at(seen_px), axis=1)
     return Tracking(
         track, strip.axis, kymograph, number, pictures, followed.exposure_frames, shake_px,
         followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame, ending,
