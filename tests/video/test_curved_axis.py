@@ -156,8 +156,7 @@ def test_a_curve_is_the_axis_where_it_explains_more_in_a_band_of_one_width(monke
     found = {"find_axis": Axis((20.0, 30.0), (220.0, 30.0), 40.0), "find_curve": replace(quarter(), width_px=width_px)}
     for name, axis in found.items():
         monkeypatch.setattr(curves, name, lambda _, axis=axis: axis)
-    monkeypatch.setattr(curves, "front_share", lambda *_: 1.0)
-    monkeypatch.setattr(curves, "front_share_of_picture", lambda _, axis: share if axis.bends else 0.65)
+    monkeypatch.setattr(curves, "front_share", lambda _, axis, **__: share if axis.bends else 0.65)
     assert curves.find_growth_axis(None).bends is bends
 
 

@@ -33,7 +33,8 @@ from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.importers import read_track
-from vinetrack.video.survey import MIN_PICTURES, entries, is_calibration, list_recordings, natural_order
+from vinetrack.video.survey import entries, is_calibration, list_recordings, natural_order
+from vinetrack.video.track import FEWEST_FRAMES
 
 # ------------------------------------------------------------------------------
 # A quantity has one column in a table, in whichever unit.
@@ -459,7 +460,7 @@ _SPACED_UNIT = re.compile(rf"(?<![a-z0-9])({_NUMBER_IN_NAME})[_\s]+({'|'.join(_U
 def list_pictures(folder: Path) -> list[str]:
     """Return single pictures and films that may show a ruler or a board, as paths relative to the folder."""
     pictures = [path for path in entries(folder) if path.is_file() and path.suffix.lower() in IMAGES]
-    pictures = pictures if len(pictures) < MIN_PICTURES else []
+    pictures = pictures if len(pictures) < FEWEST_FRAMES else []
     for sub in entries(folder):
         if sub.is_dir() and is_calibration(sub):
             pictures += [path for path in entries(sub) if path.suffix.lower() in IMAGES | CONTAINERS]

@@ -254,23 +254,23 @@ def _line_of_beginning(small: SmallPictures, whole: _Line) -> _Line:
     return max(orderly, key=lambda line: line.front_share * line.collected, default=whole)
 
 
-def front_share(small: SmallPictures, axis: Axis) -> float:
-    """Share of the growth along an axis that is one front passing once; 0 where hardly any pixel grows there."""
+def front_share(small: SmallPictures, axis: Axis, of_picture: bool = False) -> float:
+    """Share of the growth along an axis, or of all growth in the picture, that is one front passing once; 0 where
+    hardly any pixel grows there.
+    """
     band = float(np.clip(0.6 * axis.width_px / small.factor, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
     along = along_axis(small, small.grown, axis)
     near = along.where(np.abs(along.y) < band)
-    return share_on_front(near, band) if len(near.x) >= 12 else 0.0
+    if len(near.x) < 12:
+        return 0.0
+    on_front = _on_front(near, band, order_tolerance(near.n_times))
+    return float(near.weight[on_front].sum() / (along if of_picture else near).weight.sum())
 
 
 def along_axis(small: SmallPictures, pixels: Pixels, axis: Axis) -> Pixels:
     """The pixels by their places along and across an axis, all of the small pictures."""
     along, across = axis.along_and_across((np.column_stack([pixels.x, pixels.y]) + 0.5) * small.factor - 0.5)
     return pixels._replace(x=along / small.factor, y=across / small.factor)
-
-
-def share_on_front(along: Pixels, band: float) -> float:
-    """Share of their change that is on a front passing once along a line, of pixels by their places along it."""
-    return float(along.weight[_on_front(along, band, order_tolerance(along.n_times))].sum() / along.weight.sum())
 
 
 def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
@@ -394,21 +394,15 @@ def _on_front(along: Pixels, band: float, slack: float) -> Bools:
 def find_growth_axis(small: SmallPictures) -> Axis:
     """Find the growth axis from the motion: a straight line, or a curve where that explains more in less width."""
     curve = find_curve(small)
-    if curve is None or min(front_share_of_picture(small, curve), front_share(small, curve)) < LEAST_FRONT_SHARE:
+    if curve is None or front_share(small, curve, of_picture=True) < LEAST_FRONT_SHARE:
         return find_axis(small)
     try:
         straight = find_axis(small)
     except RecordingError:
         return curve
-    of_curve, of_line = (front_share_of_picture(small, axis) / axis.width_px for axis in (curve, straight))
+    of_curve, of_line = (front_share(small, axis, of_picture=True) / axis.width_px for axis in (curve, straight))
     # 1.3: least ratio of what curve and line explain in a band of one width (measured)
     return curve if of_curve > 1.3 * of_line else straight
-
-
-def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
-    """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
-    along, band = along_axis(small, small.grown, axis), max(0.6 * axis.width_px / small.factor, 2.0)
-    return share_on_front(along, band) if (np.abs(along.y) < band).any() else 0.0
 
 
 def find_curve(small: SmallPictures) -> Axis | None:

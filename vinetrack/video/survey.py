@@ -128,8 +128,6 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
 # ------------------------------------------------------------------------------
 # Recordings that lie in the folder.
 
-MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
-
 
 def list_recordings(folder: Path, depth: int = 4) -> list[str]:
     """Return the recordings below a folder, as relative paths in natural order."""
@@ -139,7 +137,7 @@ def list_recordings(folder: Path, depth: int = 4) -> list[str]:
         if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
             found.append(path.name)
         elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
-            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= MIN_PICTURES:
+            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= FEWEST_FRAMES:
                 found.append(path.name)
             elif depth > 0:
                 found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
@@ -165,7 +163,7 @@ def _is_stack(path: Path) -> bool:
 
     if path.suffix.lower() in (".tif", ".tiff"):
         with contextlib.suppress(OSError), Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= MIN_PICTURES
+            return getattr(image, "n_frames", 1) >= FEWEST_FRAMES
     return False
 
 
