@@ -106,7 +106,8 @@ class Trial:
     mass_loss: str = "geometric"
     tail_slack: str = "taut"
     tail_store: str = "body"
-    position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN: the lens is unknown
+    position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN where it is not stated
+    systematic_of_travel: float = SYSTEMATIC_OF_TRAVEL  #: that where it is not stated, as a part of the longest travel
     specimen: str = ""
     day: str = ""
     order: float = math.nan

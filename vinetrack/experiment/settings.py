@@ -193,8 +193,8 @@ class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
     """How the moving mass decreases: by the geometry of eversion, or as printed in the paper."""
     position_systematic_mm: Annotated[Number, Field(ge=0, le=100)] | None = None
     """Standard deviation of smooth position errors shared by all trials, such as lens distortion; by default
-    0.04 % of the longest travel for positions measured elsewhere and for a scale from two points or mm_per_px, 0 for a
-    calibration target."""
+    0.04 % of the longest travel for positions measured elsewhere and for a scale from two points or mm_per_px, 0.005 %
+    for a calibration target."""
     model: tuple[str, ...] = BASE_EFFECTS
     """Effects of the model in use."""
     candidates: tuple[str, ...] | None = None

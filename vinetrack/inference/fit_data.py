@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import InputError, UserError, reasons_told
-from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
+from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, with_flag
 from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
@@ -218,7 +218,7 @@ def prepare_trial(
         imprecise_rest=imprecise_rest,
         position_systematic_m=trial.position_systematic_m
         if math.isfinite(trial.position_systematic_m)
-        else SYSTEMATIC_OF_TRAVEL * moved_m,
+        else trial.systematic_of_travel * moved_m,
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
@@ -419,12 +419,13 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
             data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)
-    # Where nothing knows the lens, its smooth errors are a part of the longest travel of the trials that are fitted.
+    # Smooth errors that are not stated are a part of the longest travel of the trials that are fitted.
     seen = [track.lead_position_m[track.usable] for trial, track in pairs if trial.name not in left_out]
-    lens_m = SYSTEMATIC_OF_TRAVEL * max((float(np.ptp(position_m)) for position_m in seen), default=0.0)
+    longest_m = max((float(np.ptp(position_m)) for position_m in seen), default=0.0)
     for i, one in enumerate(data):
         if not math.isfinite(one.trial.position_systematic_m):
-            data[i] = replace(one, position_systematic_m=max(one.position_systematic_m, lens_m))
+            smooth_m = max(one.position_systematic_m, one.trial.systematic_of_travel * longest_m)
+            data[i] = replace(one, position_systematic_m=smooth_m)
     return _with_errors_of_length(_with_weighted_points(data) if weighted else data), left_out
 
 

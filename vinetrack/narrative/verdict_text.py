@@ -81,7 +81,7 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
 SHARED_REMEDIES = {
     "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
     "tracking": "film the edge larger or sharper",
-    "lens": "film a ruler along the growth, and state how uneven its marks are (position_systematic_mm)",
+    "lens": "film a board or a ruler along the growth, and state how far its marks are off (position_systematic_mm)",
 }  # fmt: skip
 
 

@@ -39,7 +39,7 @@ from vinetrack.experiment.folder import (
 )
 from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import Limits, read_experiment_settings
-from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, expected_systematic_m
+from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, systematic_of_travel
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import write_figure
 from vinetrack.inference.fit import fit
@@ -484,15 +484,14 @@ def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
     # 1e-4: noise of a position, m (chosen)
     usual = "guess: a usual batch of vines"
     noise, spreads, inputs = request.scatter((1e-4, 0.0), "guess", first.spreads, usual)
-    systematic_m, systematic_origin = expected_systematic_m(settings), "experiment.yaml"
-    if settings.position_systematic_mm is None:
-        systematic_origin = "lens known from a target"
-    if math.isfinite(request.systematic_mm):
-        systematic_m, systematic_origin = request.systematic_mm / 1e3, "stated"
-    elif not math.isfinite(systematic_m):
+    systematic_m, systematic_origin = request.systematic_mm / 1e3, "stated"
+    if math.isnan(systematic_m) and settings.position_systematic_mm is not None:
+        systematic_m, systematic_origin = settings.position_systematic_mm / 1e3, "experiment.yaml"
+    elif math.isnan(systematic_m):
         longest_m = max((trial.length_m for trial in planned.trials if math.isfinite(trial.length_m)), default=0.0)
-        systematic_m = SYSTEMATIC_OF_TRAVEL * longest_m
-        systematic_origin = "guess: positions by a scale, lens uncorrected"
+        systematic_m = systematic_of_travel(settings) * longest_m
+        is_known = systematic_of_travel(settings) < SYSTEMATIC_OF_TRAVEL
+        systematic_origin = f"guess: {'lens by a target' if is_known else 'positions by a scale, lens uncorrected'}"
     trials, rates = [], []
     for trial in planned.trials:
         if not math.isfinite(trial.yield_pressure_Pa):

@@ -28,8 +28,9 @@ from vinetrack.video.strip import Look, Positions, Strip, Tracker, calibrated_si
 # ------------------------------------------------------------------------------
 # State of the tracker and the steps of its alternation: estimate film and background, then fit the edge.
 
-# Frames before and after the passage of the edge over which the weight of a pixel's values falls to 1/e (chosen)
-MEMORY_FRAMES = 6.0
+# Frames before and after the passage of the edge over which the weight of a pixel's values falls to 1/e: more of them
+# would show a door where background stands once it has left (measured)
+MEMORY_FRAMES = 3.0
 # Standard deviation, grey levels, of a pixel about the mean of its neighbours, used where the pixel was never visible
 TEXTURE_SD = 12.0
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
@@ -715,9 +716,9 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
     guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
     slow = np.sqrt(unseen**2 + shared**2 + guess**2)
-    # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
+    # 1.5: misfit over the usual one above which a frame near the start is doubtful, and amplitude (relative contrast)
     # above which any is, since something adds to the edge (chosen)
-    odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
+    odd = (_near_start(edge_now) & (ratio > 1.5)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
     # 1.0: standard error above which a point is doubtful, px (chosen)
     uncertain = np.hypot(sigma, slow) > 1.0
     return Positions(
