@@ -81,7 +81,7 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
 SHARED_REMEDIES = {
     "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
     "tracking": "film the edge larger or sharper",
-    "lens": "film a board or a ruler along the growth, and state how far its marks are off (position_systematic_mm)",
+    "lens": "film a board that fills the picture, or a ruler along the growth (position_systematic_mm)",
 }  # fmt: skip
 
 
