@@ -716,9 +716,9 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
     guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
     slow = np.sqrt(unseen**2 + shared**2 + guess**2)
-    # 1.5: misfit over the usual one above which a frame near the start is doubtful, and amplitude (relative contrast)
+    # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
     # above which any is, since something adds to the edge (chosen)
-    odd = (_near_start(edge_now) & (ratio > 1.5)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
+    odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
     # 1.0: standard error above which a point is doubtful, px (chosen)
     uncertain = np.hypot(sigma, slow) > 1.0
     return Positions(
