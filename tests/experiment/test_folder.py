@@ -24,6 +24,7 @@ from vinetrack.experiment.settings import (
     run_settings,
     setting_entries,
 )
+from vinetrack.experiment.sheet import systematic_of_travel
 from vinetrack.pipeline.workflow import model_problems
 from vinetrack.video.survey import in_no_row
 
@@ -222,6 +223,8 @@ def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_st
     for setting, expected_m in (("", math.nan), ("_systematic_mm: 0.25", 2.5e-4), ("_systematic_mm: 0", 0)):
         trial = one(folder, f"position{setting}\n" if setting else "").trials[0]
         assert trial.position_systematic_m == pytest.approx(expected_m, nan_ok=True)
+    demo = read_experiment_settings(Path(__file__).parents[2] / "data" / "demo" / "experiment.yaml")
+    assert [systematic_of_travel(demo, elsewhere) for elsewhere in (False, True)] == [5e-5, 4e-4]
 
 
 def test_check_names_the_trial_whose_track_is_wrong(folder):
