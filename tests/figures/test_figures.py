@@ -142,7 +142,7 @@ def test_every_condition_has_a_panel_with_its_numbers(draw, n_conditions: int) -
     fig = draw(*comparison(n_conditions))
     shown = [ax for ax in fig.axes if ax.get_visible()]
     assert [ax.get_title(loc="left") for ax in shown] == [f"12 mm, {i} kPa, 35.6 g" for i in range(n_conditions)]
-    assert {ax.texts[0].get_text() for ax in shown} == {"rms 5 mm (5×)\nN = 2"}
+    assert {ax.texts[0].get_text() for ax in shown} == {"rms 5 mm\nN = 2"}
     assert len(render(fig, ["svg"])["svg"]) < 1_500_000
     if draw is motion_figures.draw_model_residuals:
         assert shown[0].lines[-1].get_ydata()[-1] == pytest.approx(5.0)
