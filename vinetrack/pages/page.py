@@ -480,12 +480,12 @@ class Page:
     def _headline(self) -> str:
         """The error of the model now and as the page opened, beside that of an adequate model, as a heading."""
         campaign, shown, known, effects = self.campaign, self.shown, self.diagnosis, self.choice.effects
-        errors_m = {} if shown is None else shown.errors_m
+        errors_m, words = {} if shown is None else shown.errors_m, model_text(effects)
         highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
         now, before = ("" if one is None else _in_mm(one.rms_m) for one in (shown, self.background.prediction))
         return panel(
             "headline",
-            model=model_text(effects).capitalize(),
+            model=words[:1].upper() + words[1:],
             now=now,
             before=before,
             beyond=beyond_adequate(errors_m.values(), highest_m, bool(known and known.refutes(effects))),
