@@ -368,9 +368,10 @@ def trial_effect_step(cross_products: Floats, problem: MixedProblem, state: FitS
 
 
 def _held(precision: Floats, problem: MixedProblem) -> Floats:
-    """Precisions of the trial effects by which a step of the release over its reach costs 1. Of a vine filmed at steady
-    speed alone nothing tells the release; a full step, far beyond its start or end, would spoil that of all trials.
-    `trial_effects.likelier_releases` searches further away. Shapes: precision (n_trials, n_effects).
+    """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine filmed
+    at steady speed alone nothing tells the release: a full step, far beyond its start or end, would spoil that of all
+    trials, and steps of several frames would undo what `trial_effects.likelier_releases` finds, time and again. Shapes:
+    precision (n_trials, n_effects).
     """
     held = precision.copy()
     held[:, RELEASE] += 1 / problem.release_reach_s**2

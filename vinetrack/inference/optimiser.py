@@ -56,8 +56,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     )
     # 10.0, 10.0: prior standard deviations of release, frames, and of origin, in standard deviations of the noise
     # (chosen)
-    reach = 10.0 * frames
-    release_sd = np.where(rests, reach, 3 * durations)
+    release_sd = np.where(rests, 10.0 * frames, 3 * durations)
     # 1e-6: prior standard deviation of the release of a vine that was pressurised during the recording: it is
     # known (chosen)
     release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = 1e-6
@@ -70,7 +69,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
         gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
         release_origin_mean=np.where(release_known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
-        release_reach_s=reach,
+        release_reach_s=frames,
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
         lower=lower,
