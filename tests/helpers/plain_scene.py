@@ -28,6 +28,7 @@ class Plan:
     end_frames: int = 8
     speed: float = 20.0
     rise_frames: float = 8.0
+    slows_frames: float = 0.0  # In place of both: the time constant with which it creeps to its end
     exposure: float = 0.2
     radius: float = 30.0
     tip_depth: float = 10.0
@@ -70,6 +71,7 @@ def travel(plan: Plan, time: np.ndarray) -> np.ndarray:
     """Edge against time in frames: rest, exponential approach to `speed`, dead stop at `end_px`."""
     t = np.clip(time - plan.rest_frames, 0.0, None)
     run = plan.speed * (t - plan.rise_frames * (1 - np.exp(-t / plan.rise_frames)))
+    run = (plan.end_px - plan.start_px) * (0.999 - 0.999 * np.exp(-t / plan.slows_frames)) if plan.slows_frames else run
     return np.minimum(plan.start_px + run, plan.end_px)
 
 

@@ -65,13 +65,13 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
 
 
 def moving_frames(edge: Floats) -> Bools:
-    """Return the frames in which the edge moves, or is on its way between two rests however slowly; all frames if fewer
-    than five do. Shapes: edge (n_frames,) → (n_frames,).
+    """Return the frames in which the edge moves, and those in which it creeps on to its end; all frames if fewer than
+    five do. Shapes: edge (n_frames,) → (n_frames,).
     """
-    speed = np.abs(np.gradient(edge))
-    # 2.0: distance from where it starts and ends beyond which an edge has not come to rest, px (chosen)
-    on_its_way = (edge > edge.min() + 2.0) & (edge < edge.max() - 2.0)
-    moving = on_its_way | (speed > max(0.2, 0.1 * np.sort(speed)[int(0.95 * (len(speed) - 1))]))
+    speed, frames = np.abs(np.gradient(edge)), np.arange(len(edge))
+    moving = speed > max(0.2, 0.1 * np.sort(speed)[int(0.95 * (len(speed) - 1))])
+    # 2.0: distance from its end up to which an edge has come to rest, px (chosen)
+    moving |= (frames > frames.max(initial=0, where=moving)) & (edge < edge.max() - 2.0)
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
