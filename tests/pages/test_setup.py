@@ -195,6 +195,13 @@ def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
     assert draft.read_block("late,36") == [["late", "36"]]
 
 
+def test_a_cell_as_long_as_its_column_in_notes_has_one_blank_behind_it():
+    assert draft.read_block("clip      tube  psi\nC2031.MP4 B     1.5") == [
+        ["clip", "tube", "psi"],
+        ["C2031.MP4", "B", "1.5"],
+    ]
+
+
 @pytest.mark.parametrize(
     "given",
     [

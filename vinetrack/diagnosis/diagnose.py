@@ -134,7 +134,8 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
     steps = select_effects(fit, effects, report)
     rounds = tuple(_to_round(step, not_testable) for step in steps)
     explanation = " ".join(finished.explanation for finished in rounds)
-    lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
+    lacks = {name: why for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)}
+    lack_columns = [name for name, why in lacks.items() if why.facts.get("column") != "payload_g"]  # blank: none
     not_tried = lack_columns if any(finished.verdict == UNEXPLAINED for finished in rounds) else []
     return Diagnosis(
         rounds=rounds,

@@ -458,7 +458,7 @@ def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
     if not step.partial:
         return text
     last = step.partial[-1]
-    added = joined([f"{each.names[-1]} (Δχ² = {each.delta_chi2:.0f} in all)" for each in step.partial], "then")
+    added = joined([each.names[-1] for each in step.partial], "then")
     facts: dict[str, Any] = {"added": added, "sizes": sizes_in_words(last.numbers)}
     facts |= {"before": step.tests.fit.chi2_per_dof, "after": last.fit.chi2_per_dof}
     return f"{text} {sentence('a_part_is_explained', facts)}"

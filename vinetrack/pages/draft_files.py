@@ -306,7 +306,9 @@ def read_block(text: str) -> list[list[str]]:
     else:
         wide = any(re.search(r"\S {2,}\S", line) for line in lines)
         lines = [re.sub(rf"(\d) ((?:{'|'.join(UNITS)})\b)", r"\1\2", line.strip()) for line in lines]
-        return [re.split(r" {2,}" if wide else r"\s+", line) for line in lines]
+        rows = [re.split(r" {2,}" if wide else r"\s+", line) for line in lines]
+        # A cell as long as its column has one blank behind it.
+        return [words if len(words := line.split()) == len(rows[0]) else row for row, line in zip(rows, lines, strict=True)]
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
 
 
