@@ -308,7 +308,8 @@ def read_block(text: str) -> list[list[str]]:
         lines = [re.sub(rf"(\d) ((?:{'|'.join(UNITS)})\b)", r"\1\2", line.strip()) for line in lines]
         rows = [re.split(r" {2,}" if wide else r"\s+", line) for line in lines]
         # A cell as long as its column has one blank behind it.
-        return [words if len(words := line.split()) == len(rows[0]) else row for row, line in zip(rows, lines, strict=True)]
+        words = map(str.split, lines)
+        return [one if len(one) == len(rows[0]) else row for row, one in zip(rows, words, strict=True)]
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
 
 
