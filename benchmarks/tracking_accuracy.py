@@ -231,6 +231,7 @@ HARDER: dict[str, dict] = {
     "half_exposure": {"speed": 40.0, "exposure": 0.5, "rise_frames": 4.0},
     "payload": {"payload": True, "door": True},
     "slow": {"speed": 3.0, "rise_frames": 30.0},
+    "creeps_on": {"slows_frames": 60.0},
     "reversal": {"gradient": 110.0, "film": 130.0},
     "oblique": {"angle_deg": 12.0, "from_px": (30.0, 45.0), "end_px": 700.0},
     "leftward": {"angle_deg": 180.0, "from_px": (920.0, 120.0)},

@@ -68,10 +68,7 @@ def write_diagnosis(results: Path) -> Path:
 
 
 def film_of(experiment: Path, results: Path, trial: str) -> Path:
-    """Give one trial of a results folder a recording: a bright bar whose right end follows the track.
-
-    The scale is 4 px per millimetre, with the axis along row 48 from column 20.
-    """
+    """Give one trial of a results folder a recording: a bright bar whose end follows the track, 4 px/mm, row 48."""
     track = pd.read_csv(results / "tracks" / f"{trial}.csv", keep_default_na=False, na_values=["", "NaN"])
     position_m = track["lead_position_m"].interpolate(limit_direction="both").to_numpy()
     edge_px = 20 + 4e3 * (position_m - position_m[0])

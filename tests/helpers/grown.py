@@ -59,10 +59,7 @@ def pairs_of(virtual: Sequence[VirtualTrial]) -> Pairs:
 
 
 def effect_file(folder: Path) -> Path:
-    """A user's effect `hidden`: a tail force of size `a`, N, times that of `FORCES` whose place is `kind`.
-
-    One file for all of them is compiled once.
-    """
+    """A user's effect `hidden`: a tail force of size `a`, N, times that of `FORCES` whose place is `kind`."""
     shapes = enumerate(FORCES.values())
     choices = "\n".join(f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in shapes)
     text = f'''"""Forces that no catalogue has.

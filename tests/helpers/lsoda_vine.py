@@ -25,10 +25,7 @@ def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more
 
 
 def grown_position(trial: Trial, time_s, B: float, n=N_TRUE, pressure_gain=1.0, pressure_along=None) -> np.ndarray:
-    """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail.
-
-    `pressure_along` gives the gauge pressure by lead position, in place of the set one.
-    """
+    """Lead position at times since release, NaN beyond 96 % of the length; `pressure_along` is a pressure by it."""
     area = math.pi * trial.diameter_m**2 / 4
     film = trial.film_density_kg_m3 * math.pi * trial.diameter_m * trial.thickness_m
     gravity = 9.81 * math.cos(trial.growth_angle_rad)

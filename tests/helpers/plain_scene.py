@@ -1,6 +1,5 @@
-"""Recordings with a known leading edge, drawn by code that shares nothing with the package.
+"""Recordings with a known leading edge, drawn by code that shares nothing with the package: a truth of another hand.
 
-A truth of another hand than the laboratory's: no import of `vinetrack`, another tip, another film, another door.
 `plain_scene` draws frames in memory, `write_video` and `write_images` put them in files.
 """
 
@@ -46,8 +45,7 @@ class Plan:
     door: bool = False
     gradient: float = 0.0
     payload: bool = False
-    mouth: float = 0.0
-    """How far beyond the resting tip a launcher covers the tube; none at 0."""
+    mouth: float = 0.0  # How far beyond the resting tip a launcher covers the tube
     mouth_grey: float = 20.0
 
 

@@ -122,10 +122,7 @@ class Visitor:
         self.chrome.click(x, y)
 
     def drag(self, name: str, path: list[float], after: Callable[[], None]) -> None:
-        """Drag the handle of a slider by fractions of its width, positive to the right.
-
-        `after` is called after every move, with the button still pressed.
-        """
+        """Drag a slider by fractions of its width, positive to the right; `after` is called after every move."""
         _, _, whole = self.place(name, ".noUi-target")
         x, y, _ = self.place(name, ".noUi-handle")
         self.chrome.mouse("move", x, y)

@@ -193,13 +193,8 @@ def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
     assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
     assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
     assert draft.read_block("late,36") == [["late", "36"]]
-
-
-def test_a_cell_as_long_as_its_column_in_notes_has_one_blank_behind_it():
-    assert draft.read_block("clip      tube  psi\nC2031.MP4 B     1.5") == [
-        ["clip", "tube", "psi"],
-        ["C2031.MP4", "B", "1.5"],
-    ]
+    notes = "clip      tube  psi\nC2031.MP4 B     1.5"  # A cell as long as its column has one blank behind it.
+    assert draft.read_block(notes) == [["clip", "tube", "psi"], ["C2031.MP4", "B", "1.5"]]
 
 
 @pytest.mark.parametrize(

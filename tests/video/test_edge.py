@@ -38,14 +38,12 @@ def followed(**changes) -> tuple[Scene, Tracking]:
     return scene, pictures.tracked(scene.frames, scene.plan.exposure)
 
 
-CREEPS_PX = 0.6  # What passes for rest at the start and at the end
-
-
 def errors(scene: Scene, tracking: Tracking) -> tuple[np.ndarray, np.ndarray]:
     """Tracked minus true edge of the moving frames, none of which may be lost, px, and the stated errors."""
     angle = np.radians(scene.plan.angle_deg)
     origin = (np.asarray(tracking.axis.from_px) - scene.plan.from_px) @ [np.cos(angle), np.sin(angle)]
-    shown = scene.moving & (np.abs(scene.edge_px - scene.edge_px[[0, -1]][:, None]).min(axis=0) > CREEPS_PX)
+    # Nearer to its ends what creeps passes for rest.
+    shown = scene.moving & (np.abs(scene.edge_px - scene.edge_px[[0, -1]][:, None]).min(axis=0) > 0.6)
     assert tracking.track.usable[shown].all()
     error = tracking.track.edge_px + origin - scene.edge_px
     stated = np.hypot(tracking.track.lead_position_sigma_m, tracking.track.lead_position_systematic_m)
