@@ -659,10 +659,15 @@ class MisfitTests:
         return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < 1e-2
 
     @cached_property
+    def of_probes(self) -> MisfitTests:
+        """The tests of the probe forces alone."""
+        products = products_of(self.fit, _probe_shapes(self.fit))
+        return MisfitTests(self.fit, (), products, scores_of(self.fit, products), min(PROBE_LEVEL, self.level))
+
+    @property
     def probes_reject(self) -> bool:
         """Whether a smooth force would improve the fit."""
-        products, level = products_of(self.fit, _probe_shapes(self.fit)), min(PROBE_LEVEL, self.level)
-        return MisfitTests(self.fit, (), products, scores_of(self.fit, products), level).any_exceeds(level)
+        return self.of_probes.any_exceeds(self.of_probes.level)
 
     @cached_property
     def predicted_gains(self) -> Floats:

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import (
+    ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
     LikelihoodRatio,
     answer_set,
@@ -52,7 +53,7 @@ from vinetrack.diagnosis.result import (
     UNEXPLAINED,
     Confounder,
 )
-from vinetrack.dynamics.model import Model, Value
+from vinetrack.dynamics.model import Model, Value, probe
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import is_poor_fit
@@ -193,9 +194,29 @@ class Search:
         if after := full_fit(fit, reduce(Model.__add__, effects, self.before.model)):
             self._keep_best(likelihood_ratio(self.before, effects, after))
 
+    @cached_property
+    def of_one_force(self) -> float:
+        """Ln L of the model with one unknown force that depends on one variable: a bump along growth, speed or time,
+        its place and width free.
+        """
+        self.report("fitting one unknown force")
+        tests, fixed = self.tests.of_probes, (*self.before.options["fixed"], "probe_force.kind")
+        found = []
+        for kind in (0.0, 1.0, 2.0):
+            along = [k for k, shape in enumerate(tests.products.shapes) if shape.other_values[0] == kind]
+            best = max(along, key=lambda k: tests.predicted_gains[k], default=None)
+            if best is not None:
+                start = start_values(tests.products.shapes[best], float(tests.scores.size[best]))
+                found.append(full_fit(self.before, self.before.model + probe(), start=start, fixed=fixed))
+        return max((fit.log_likelihood for fit in found if fit is not None), default=-math.inf)
+
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
-        """Find the first member of a set whose significance given the others is too low, or not known."""
-        for effect in hypothesis.effects:
+        """Why several effects need not be: one unknown force is as likely; or, of three or more, the first member whose
+        significance given the others is too low, or not known.
+        """
+        if self.of_one_force > hypothesis.fit.log_likelihood - 0.5 * ANSWER_SET_DELTA_CHI2 * hypothesis.inflation:
+            return remark("one_force_is_as_likely")
+        for effect in hypothesis.effects if len(hypothesis.effects) > 2 else ():
             self.report(f"taking out {effect.name}")
             others = [other for other in hypothesis.effects if other is not effect]
             smaller = self.subset(hypothesis, others, again=True)
@@ -344,7 +365,7 @@ def adequate_hypotheses(
         # first round, which rejects more readily.
         if tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
             rejected[hypothesis.label] = MISFIT_REMAINS
-        elif len(hypothesis.effects) > 2 and (reason := search.superfluous(hypothesis)):
+        elif len(hypothesis.effects) > 1 and (reason := search.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
         else:
             adequate.append(hypothesis)
