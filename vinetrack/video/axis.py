@@ -230,7 +230,7 @@ def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
     if best.collected <= 0 and len(small.changed.x) < 12:
         raise RecordingError("nothing moves in the picture")
     if best.collected <= 0:
-        raise RecordingError("what moves in the picture follows no line", "give the axis in the settings")
+        raise RecordingError("what moves in the picture follows no line", "draw its axis on the set-up page")
     # In full pixels, with a margin behind the line, and extended ahead to the border of the picture
     along, factor, (height, width) = _along_and_side(best.angle)[0], small.factor, small.shape
     centre = (best.middle + 0.5) * factor - 0.5
