@@ -30,7 +30,7 @@ def sets_of(known: list[LikelihoodRatio], thresholds=None) -> Search:
     family = dict.fromkeys(NAMES, 4.0) | dict(thresholds or {})
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
     search = Search(tests, lambda _line: None)
-    search.tests_after = lambda _fit: after
+    search.tests_after, search.of_one_force = (lambda _fit: after), -math.inf
     for hypothesis in known:
         search._keep_best(hypothesis)
     return search
@@ -65,6 +65,9 @@ def test_each_member_of_three_is_worth_its_threshold_beside_the_others(worth, en
     # One that is tried in many shapes is asked for its own threshold.
     assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
     assert sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple).facts["required"] == 6.6
+    sets = sets_of(pairs(30.0))
+    for sets.of_one_force, code in ((TRIPLE - 4.6, ""), (TRIPLE - 4.4, "one_force_is_as_likely")):
+        assert sets.superfluous(triple).code == code
 
 
 @pytest.mark.parametrize(("scattered", "worth"), [(2, 5.5), (0, 11.0)])
