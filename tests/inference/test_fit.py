@@ -558,12 +558,12 @@ def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials()
 @pytest.fixture(scope="module")
 def only_in_motion():
     """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
-    pairs = [(trial, track, track.time_s > 0.03) for trial, track in small_campaign(seed=7, replicates=1)[0]]
+    pairs = [(trial, track, track.time_s > 0.03) for trial, track in small_campaign(seed=13, replicates=1)[0]]
     return vt.fit(vt.base_model(), [(t, as_track(x.time_s[seen], x.lead_position_m[seen])) for t, x, seen in pairs])
 
 
 def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
-    # 9; 56 where the release of a vine at steady speed, which nothing tells, refuses the steps of all.
+    # 9; 60 where a release that nothing tells moves on by frames, and searches for likelier ones take it back.
     assert only_in_motion.converged
     assert only_in_motion.iterations < 20
     assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
