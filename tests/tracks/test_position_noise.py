@@ -354,6 +354,17 @@ def test_a_copy_changes_times_only_where_it_was_inserted():
         assert np.all(np.diff(out.time_s) > 0)
 
 
+@pytest.mark.parametrize("rows", [(70, 72), (70, 72, 74), range(60, 125, 5)], ids=["two", "three", "every fifth"])
+def test_copies_close_together_are_all_found(rows):
+    """As a film exported at 30 frames a second from one of 24 has them."""
+    clean = track = still_then_even()
+    for row in rows:
+        track = inserted(track, row)
+    out = correct_frames(track)
+    assert flags(out) == dict.fromkeys(rows, "duplicate")
+    np.testing.assert_allclose(np.delete(out.time_s, rows), clean.time_s, atol=1e-12)
+
+
 @pytest.mark.parametrize(("vine", "noise_m", "rho"), CLEAR)
 @pytest.mark.parametrize("fault", [stale, inserted, dropped])
 def test_faults_in_clear_motion_are_found(vine, noise_m, rho, fault):

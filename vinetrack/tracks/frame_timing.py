@@ -20,12 +20,19 @@ import numpy as np
 
 from vinetrack.core.problems import Remark, confirmed, remark
 from vinetrack.core.records import Floats, Track, Trial, with_flag
-from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
+from vinetrack.tracks.position_noise import (
+    THIRD_DIFFERENCE_SD,
+    local_noise,
+    position_noise,
+    reject_outliers,
+    rounding_noise,
+)
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
 CLEAR_STEP_SIGMAS = 8.0
 
-DROP_RATIO = 1.6  # Ratio of a step to its neighbours above which frames were dropped (chosen)
+# Ratios of a step to its neighbours below which it may repeat a frame, and above which frames were dropped (chosen)
+SHORT_STEP, DROP_RATIO = 0.4, 1.6
 
 JUMP_SIGMAS = 5.5  # Least significance of a jump, in standard errors (derived)
 
@@ -102,16 +109,34 @@ def frames_surely_missing(track: Track) -> bool:
 def _noise(track: Track) -> tuple[Floats, float]:
     """Standard deviation of a position at each row of a track, m, and the lag-one correlation of the noise. It is that
     of the whole track, or of the points around where that is larger: an edge far from the lamp is noisier than at rest,
-    and its noise makes jumps there.
+    and its noise makes jumps there. Rows that seem to repeat the one before are no noise.
     """
-    usable = track.usable
-    y = track.lead_position_m[usable]
-    whole_m, rho = position_noise(track.time_s[usable], y, robust=True)
-    noise_m = np.full(usable.size, whole_m)
+    rows = np.flatnonzero(track.usable)
+    y = track.lead_position_m[rows]
+    speed, _, larger = _steps(np.arange(float(y.size)), y)
+    # 0.1: part of the highest speed from which a step is one of a motion (chosen)
+    single = np.append(True, (speed >= SHORT_STEP * larger) | ~(larger > 0.1 * np.nanmax(larger, initial=0.0)))
+    rounding_m, kept, y = rounding_noise(y), rows[single], y[single]
+    whole_m, rho = position_noise(track.time_s[kept], y, robust=True)
+    whole_m = max(whole_m, rounding_m)
+    noise_m = np.full(track.time_s.size, whole_m)
     if y.size > 2 * WIDE_SIDE_POINTS:
-        around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS)
-        noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
+        around_m = np.pad(local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS), (1, 2), "edge")
+        noise_m[rows] = np.fmax(whole_m, np.interp(rows, kept, around_m))
     return noise_m, rho
+
+
+def _steps(frame: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Speed of each step, m a frame, and the smaller and the larger of those around it: medians of the three steps
+    before and the three after, NaN where there are none. Shapes: frame, y (n,) → (n − 1,).
+    """
+    import pandas as pd
+
+    speed = np.diff(y) / np.diff(frame)
+    earlier, later = (
+        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
+    )
+    return speed, np.fmin(np.abs(earlier), np.abs(later[::-1])), np.fmax(earlier, later[::-1])
 
 
 def _frames_are(frames: int) -> str:
@@ -123,28 +148,27 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     """The first fault on a row beyond `after`: that row, by how many frames the times from there on are early, and
     whether it repeats the row before.
     """
-    import pandas as pd
-
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-    y = track.lead_position_m[rows]
-    speed = np.diff(y) / np.diff(frame)
-    stated = track.lead_position_sigma_m[rows]
-    noise_m = noise_m[rows]
+    y, stated, noise_m = (each[rows] for each in (track.lead_position_m, track.lead_position_sigma_m, noise_m))
     # Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening. A
     # point with a large stated error, such as one that a door half hides, makes no step conclusive about frames.
-    # The neighbours are medians of the three steps before and the three after, NaN where there are none.
-    earlier, later = (
-        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
-    )
-    smaller, larger = np.fmin(np.abs(earlier), np.abs(later[::-1])), np.fmax(earlier, later[::-1])
+    speed, smaller, larger = _steps(frame, y)
     clear = larger > CLEAR_STEP_SIGMAS * np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))
-    for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))).tolist():
-        if rows[i + 1] <= after:
-            continue
-        if (fault := _fault_at(frame, y, i, noise_m[i], rho)) is not None:
+    is_odd = clear & ((speed > DROP_RATIO * smaller) | (speed < SHORT_STEP * larger))
+    suspects = np.flatnonzero(is_odd & (rows[1:] > after))
+    # 0.1: part of a step within which a copy that is judged later seems to stand still (chosen). Each is judged without
+    # those, since they may lie close together: but for those beside a long step, which may be stale, or outliers.
+    frames, is_long = np.diff(frame), np.pad(speed > DROP_RATIO * larger, 1)
+    seems_copy = is_odd & (np.abs(speed) < 0.1 * larger) & ~(is_long[:-2] | is_long[2:]) & (rows[1:] > after)
+    seem = np.where(seems_copy & (frames == 1), 0.0, frames)
+    for i in suspects.tolist():
+        seem[i] = frames[i]
+        kept = np.append(True, seem > 0)
+        others_corrected = np.append(0.0, np.cumsum(seem))[kept], y[kept]
+        if (fault := _fault_at(*others_corrected, int(np.count_nonzero(kept[:i])), noise_m[i], rho)) is not None:
             return int(rows[i + 1]), *fault
     return None
 

@@ -49,7 +49,10 @@ class ArrivalTracker(Tracker):
         )  # fmt: skip
 
 
-NO_GROWTH = "see whether it shows this vine grow, name the right recording, or state the growth axis"
+NO_GROWTH = (
+    "see whether it shows this vine grow, four times as far from its background as a pixel's noise, name the right "
+    "recording, or state the growth axis"
+)
 
 # Asked in turn: the first that knows what moves follows it; the others return None.
 TRACKERS: list[Tracker] = [BodyTracker(), EdgeTracker(), ArrivalTracker()]
