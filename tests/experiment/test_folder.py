@@ -50,6 +50,8 @@ def test_pressures_that_are_all_below_the_yield_pressure_stop_and_some_warn(fold
     told = [one for one in stopped(write(folder, written)) if one.severity == "error"]
     assert [(one.code, one.trial) for one in told] == [("no_growth", "a"), ("no_growth", "b")]
     assert len(format_problems(told)) == 1
+    pascal = GOOD.replace(",28,", ",28000,").replace(",14,", ",14000,")
+    assert len(format_problems(read_experiment(write(folder, pascal)).problems)) == 1
     some = read_experiment(write(folder, GOOD.replace(",14,", ",2.5,"))).problems
     assert [(one.code, one.severity, one.trial) for one in some] == [("no_growth", "warning", "b")]
 
