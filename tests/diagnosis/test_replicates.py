@@ -132,6 +132,12 @@ def test_rows_of_other_recordings_are_named_with_the_pressure_that_was(campaign,
     assert odd(stated(campaign[:trials], **told_kPa)) == expected
 
 
+def test_a_slip_in_a_pressure_without_replicates_is_named_among_few_trials(campaign):
+    """Eight trials at four pressures, one of them typed as a pressure of its own."""
+    of_four = [pair for pair in campaign if pair[0].pressure_Pa in (18e3, 21e3, 29e3, 40e3)]
+    assert list(odd(stated(of_four, t2=42))) == ["t2"]
+
+
 @pytest.mark.slow
 def test_a_row_that_contradicts_the_others_is_named_and_left_out(campaign):
     result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
-from vinetrack.core.records import Track, Trial, with_flag
+from vinetrack.core.records import Floats, Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
@@ -284,11 +284,12 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
 #
 #     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
 #
-# with a curvature c for a force of another power of speed. The residual of a trial from a robust fit of these curves is
-# compared with the residuals of the others. An effect that the model lacks changes all trials of a condition alike; a
-# pressure with its digits swapped does not.
+# with a curvature c for a force of another power of speed. The residual of a trial from these curves is compared with
+# the scatter of the others about them, and the farthest is left out, one after the other, up to the last that is too
+# far: two outliers cannot hide each other (generalised ESD: Rosner, Technometrics 25, 165, 1983). An effect that the
+# model lacks changes all trials of a condition alike; a pressure with its digits swapped does not.
 
-CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
+CHANCE = 1e-3  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
 
 
@@ -321,38 +322,47 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     log_force = np.log(np.maximum(force_N, 1e-9))
     log_speed = np.log([middle_speed(trial_data) for trial_data in data])
     log_speed -= np.median(log_speed)
-    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
-    usual_exponent = 0.37  # Starting value of the exponent (PHYSICS)
-    straight = log_force - usual_exponent * log_speed
-    levels = [float(np.median(straight[of_vine == vine])) for vine in vines]
-    # 0.05: residual of ln F at which the robust fit (Cauchy loss) halves the weight of a trial (chosen)
-    fitted = least_squares(
-        lambda values: log_force - curves @ values, [*levels, usual_exponent, 0.0], loss="cauchy", f_scale=0.05
-    )
-    residual = log_force - curves @ fitted.x
-    # Fitted curves follow the trials: the scatter about them is smaller by the degrees of freedom that they take.
-    median_deviation = float(np.median(np.abs(residual))) / 0.6745
-    # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
-    scatter = max(median_deviation * math.sqrt(len(data) / remaining), 0.02)
-    # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
-    # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
-    allowed = scatter * -float(stdtrit(max(0.37 * remaining + 1.0, 3.0), CHANCE / (2 * len(data))))
+    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2]).astype(float)
+    # 0.125: the largest fraction that may be outliers (chosen)
+    kept, most, far, count = np.arange(len(data)), max(2, int(0.125 * len(data))), list[int](), 0
+    while len(far) <= most:
+        residual, allowed, deviates = _deviates(curves, log_force, kept)
+        worst = int(np.argmax(deviates[kept]))
+        far.append(int(kept[worst]))
+        count = len(far) if deviates[far[-1]] > 1 else count
+        kept = np.delete(kept, worst)
+    if not 0 < count <= most:
+        return []
+    residual, allowed, _ = _deviates(curves, log_force, np.setdiff1d(np.arange(len(data)), far[:count]))
     replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip
     # Where a replicate deviates as much, the cause is physics of the condition.
     odd = [
         k
-        for k in np.flatnonzero(np.abs(residual) > allowed).tolist()
+        for k in sorted(far[:count])
         if all(abs(residual[j]) < allowed < abs(residual[k] - residual[j]) for j in replicates[k])
     ]
-    # 0.125: the largest fraction that may be outliers (chosen)
-    if len(odd) > max(2, int(0.125 * len(data))):
-        return []
-    lacking_Pa = [(np.exp(curves[k] @ fitted.x) - force_N[k]) / trials[k].area_m2 for k in odd]
+    lacking_Pa = [(math.exp(log_force[k] - residual[k]) - force_N[k]) / trials[k].area_m2 for k in odd]
     return [
         OddTrial(trials[k].name, stated_Pa[k], stated_Pa[k] + float(lacks), trials[k].pressure_unit)
         for k, lacks in zip(odd, lacking_Pa, strict=True)
     ]
+
+
+def _deviates(curves: Floats, log_force: Floats, kept: NDArray[np.intp]) -> tuple[Floats, float, Floats]:
+    """Residuals of all trials from curves through those kept, the residual allowed to one of these, and how many times
+    that each is: by Student's t of its residual from the curves through the others.
+    """
+    inverse = np.linalg.pinv(curves[kept])
+    residual, degrees = log_force - curves @ (inverse @ log_force[kept]), max(kept.size - curves.shape[1] - 1, 1)
+    left = np.zeros(residual.size)
+    left[kept] = np.clip(1 - np.sum(curves[kept] * inverse.T, axis=1), 1e-9, None)  # of a trial's own deviation
+    of_others = (np.sum(residual[kept] ** 2) - residual**2 / np.maximum(left, 1e-9)) / degrees
+    # 0.02: least scatter of ln F, that of careful trials (chosen)
+    scatter = np.sqrt(np.maximum(of_others, 0.02**2))
+    quantile = -float(stdtrit(degrees, CHANCE / (2 * kept.size)))
+    allowed = quantile * max(math.sqrt(np.sum(residual[kept] ** 2) / (degrees + 1)), 0.02)
+    return residual, allowed, np.abs(residual) / np.sqrt(np.maximum(left, 1e-9)) / scatter / quantile * (left > 1e-6)
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:
