@@ -26,8 +26,8 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (693, 4, 5),
-    "core": (948, 7, 25),
-    "diagnosis": (5790, 14, 88),
+    "core": (950, 7, 25),
+    "diagnosis": (5830, 14, 87),
     "dynamics": (2277, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
@@ -48,7 +48,7 @@ BUDGETS = {
 }
 """Lines, files and module-level constants that a room may have, lowered with the code; what moves to another room takes
 its own along. The files of single effects do not count: a new effect is free."""
-TESTS = 17_400  # Lines of Python below tests/, lowered with them
+TESTS = 17_440  # Lines of Python below tests/, lowered with them
 LET_PASS = (30, 0, 2)  # A figure or a format more is let pass: who adds it need not take out what he has not read
 
 HEAVY = {"matplotlib", "cv2", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}

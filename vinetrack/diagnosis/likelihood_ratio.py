@@ -16,7 +16,7 @@ from scipy.special import hyperu, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.misfit_tests import is_plausible
-from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
+from vinetrack.diagnosis.result import CONTAINS_AND_FITS_NO_BETTER
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
@@ -24,7 +24,8 @@ from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit
+from vinetrack.inference.optimiser import is_poor_fit, track_correlation
+from vinetrack.tracks.position_noise import rounding_noise
 
 # ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
@@ -35,8 +36,6 @@ ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of 
 OUT_OF_REACH = 54.0
 
 CREDIBLE_RANGE_FACTOR = 3.0  # Multiple of its plausible range within which a size is still credible (chosen)
-
-MIN_SIZE_SIGMAS = 1.0  # A size below this many of its standard errors is compatible with zero (chosen)
 
 
 @dataclass(frozen=True)
@@ -109,10 +108,6 @@ def likelihood_ratio(
     """Compare a refit with the fit without the effects."""
     delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
-    # A fit whose size is smaller than its error is better because of the parameters that shape the effect. Differences
-    # between groups are contrasts: each group's value may be uncertain where their difference is not.
-    in_errors = [size_in_errors(effect, after) for effect in effects if effect.kind != BETWEEN_TRIALS]
-    none = remark("size_may_be_zero") if min(in_errors, default=math.inf) < MIN_SIZE_SIGMAS else Remark()
     reason = implausible(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
@@ -120,8 +115,8 @@ def likelihood_ratio(
         delta_chi2=delta_chi2,
         sigma=in_sigmas(delta_chi2 / ratio**2, sizes_of(effects, after) if sizes is None else sizes),
         plausible=not reason,
-        reason=none or reason,
-        credible=not none and not implausible(effects, after, CREDIBLE_RANGE_FACTOR),
+        reason=reason,
+        credible=not implausible(effects, after, CREDIBLE_RANGE_FACTOR),
         inflation=ratio**2,
     )
 
@@ -160,20 +155,38 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
     return max(float(-ndtri_exp(log_p - math.log(2))), 0.0)
 
 
-def implausible(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> Remark:
-    """Why the fitted sizes are not plausible; blank where they are."""
+def implausible(effects: Sequence[Effect], after: Fit, widened: float = 1.0, errors: float = 1.0) -> Remark:
+    """Why the fitted sizes are not plausible; blank where they are, or might be within so much of their errors."""
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
+    averages = {f"{one.name}.{one.parameters[0].name}" for one in effects if "averaged_over" in one.functions}
     for number in after.numbers:
+        if number.key in averages and (frames := _frames_beyond_noise(number.value, after)):
+            return remark("noise_is_not_averaged", frames=frames)
         if (parameter := parameters.get(number.key)) is None or not math.isfinite(number.sigma):
             continue
         low, high = parameter.plausible or (math.nan, math.nan)
         # At a bound outside the plausible range the size is implausible whatever its standard error.
         at_implausible_bound = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
-        if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
+        if at_implausible_bound or not is_plausible(
+            parameter, number.value, number.sigma, widened=widened, errors=errors
+        ):
             unit = "" if parameter.unit == "1" else parameter.unit
             facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
             return Remark("implausible_size", facts | {"pressure_unit": number.pressure_unit})
     return Remark()
+
+
+def _frames_beyond_noise(average_s2: float, after: Fit) -> float:
+    """How many frames an average takes in if their noise shows that it was not taken: noise averaged over N frames has
+    a lag-one correlation of 1 − 1/N. 0 where the noise may be averaged, or is that of rounding.
+    """
+    data = [one for one in after.predictor.data if one.smoothing is None]
+    own = [one for one in data if rounding_noise(one.lead_position_m) < 0.5 * one.noise_m]
+    if not own:
+        return 0.0
+    frames = math.sqrt(1 + max(average_s2, 0.0) / float(np.median([one.frame_s for one in own])) ** 2)
+    # 3, 0.3: least number of frames, and part of the correlation that noise must show (chosen)
+    return frames if frames >= 3 and track_correlation(own) < 0.3 * (1 - 1 / frames) else 0.0
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:

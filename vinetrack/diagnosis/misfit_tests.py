@@ -188,8 +188,10 @@ def slip_of(parameter: Parameter, value: float, sigma: float) -> tuple[float, st
     return None
 
 
-def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, within its error of it, or is that of a slip."""
+def is_plausible(
+    parameter: Parameter, value: float, sigma: float, *, widened: float = 1.0, errors: float = 1.0
+) -> bool:
+    """Whether a value lies in the plausible range, within so much of its error of it, or is that of a slip."""
     if parameter.plausible is None or value == parameter.zero or slip_of(parameter, value, sigma) is not None:
         return True
     low, high = parameter.plausible
@@ -199,7 +201,7 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, widened: f
         # 3.0: factor by which a size may lie below a range that is not narrow (chosen)
         low /= 3.0
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
-    margin = REACH_SIGMAS * sigma if math.isfinite(sigma) else math.inf
+    margin = REACH_SIGMAS * errors * sigma if math.isfinite(sigma) else math.inf
     return bool(low - margin <= value <= high + margin)
 
 
@@ -645,7 +647,7 @@ class MisfitTests:
     @property
     def omnibus_rejects(self) -> bool:
         """Whether a test that names no candidate rejects: probe forces, or trial effects."""
-        return self.trial_effect_p < 0.1 * self.level or self.probes_reject
+        return self.trial_effect_p < 0.1 * self.level or self.of_probes.any_exceeds(self.of_probes.level)
 
     @cached_property
     def trial_effect_p(self) -> float:
@@ -663,11 +665,6 @@ class MisfitTests:
         """The tests of the probe forces alone."""
         products = products_of(self.fit, _probe_shapes(self.fit))
         return MisfitTests(self.fit, (), products, scores_of(self.fit, products), min(PROBE_LEVEL, self.level))
-
-    @property
-    def probes_reject(self) -> bool:
-        """Whether a smooth force would improve the fit."""
-        return self.of_probes.any_exceeds(self.of_probes.level)
 
     @cached_property
     def predicted_gains(self) -> Floats:

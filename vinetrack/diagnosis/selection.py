@@ -24,6 +24,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     best_of,
     full_fit,
+    implausible,
     in_sigmas,
     likelihood_ratio,
     robust_ratio,
@@ -138,21 +139,26 @@ class Search:
                 self._keep_best(likelihood_ratio(self.before, (effect,), full_fit(held, fixed=fixed) or held))
 
     def _fit_from_prediction(self, tests: MisfitTests, effects: Sequence[Effect], name: str) -> None:
-        """Add an effect in its shapes of largest predicted gain, until one gains what is predicted."""
+        """Add an effect in its shapes of largest predicted gain, then from its defaults, until one gains what is
+        predicted: far from the truth a prediction is too small, and a fit from there may end with no effect at all.
+        """
         self.report(f"fitting {name}")
-        shapes, starts = tests.products.shapes, dict[tuple[float, ...], int]()
+        shapes, by_gain = tests.products.shapes, dict[float, int]()
         for index in tests.ranked_shapes(name):  # A size that differs between vines is fitted so from any start.
-            starts.setdefault(shapes[index].other_values, index)
-        for index in list(starts.values())[:STARTS_PER_EFFECT]:
-            shape, size = shapes[index], float(tests.scores.size[index])
+            if all(shapes[k].other_values != shapes[index].other_values for k in by_gain.values()):
+                by_gain.setdefault(round(float(tests.predicted_gains[index]), 3), index)
+        of_gain = list(by_gain.values())[: STARTS_PER_EFFECT - 1]
+        starts = [start_values(shapes[index], float(tests.scores.size[index])) for index in of_gain]
+        effect = shapes[of_gain[0]].effect
+        for start in [*starts, {}] if len(effect.parameters) > 1 else starts:
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = (known.fit for known in self.of_size(len(effects) + 1) if known.plausible and known.credible)
             near = (fit.log_likelihood for fit in credible if not is_poor_fit(fit.predictor, fit.solution))
-            best, model = max(near, default=-math.inf), tests.fit.model + shape.effect
-            fit = full_fit(tests.fit, model, start=start_values(shape, size), best=best)
+            best, model = max(near, default=-math.inf), tests.fit.model + effect
+            fit = full_fit(tests.fit, model, start=start, best=best)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
             if fit is not None and gain >= FAILED_FIT_DELTA_CHI2:
-                self._keep_best(likelihood_ratio(self.before, (*effects, shape.effect), fit))
+                self._keep_best(likelihood_ratio(self.before, (*effects, effect), fit))
             # 0.7: share of its predicted gain that a fit must reach for no other shape to be tried (chosen)
             if gain > 0.7 * tests.predicted_gain(name):
                 break
@@ -225,6 +231,21 @@ class Search:
             if sigmas < required:
                 return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
         return Remark()
+
+    def implausible(self, hypothesis: LikelihoodRatio) -> Remark:
+        """Why sizes that lie in their plausible ranges only for their errors are not plausible: refitted within them,
+        the hypothesis can be excluded. Wide errors of sizes that make up for each other do not show that.
+        """
+        reason = implausible(hypothesis.effects, hypothesis.fit, errors=0.0) if hypothesis.plausible else Remark()
+        if not reason:
+            return reason
+        bounded = [
+            replace(one, parameters=tuple(replace(each, bounds=plausible_range(each)) for each in one.parameters))
+            for one in hypothesis.effects
+        ]
+        within = full_fit(hypothesis.fit, reduce(Model.__add__, bounded, self.before.model))
+        lost = math.inf if within is None else 2 * (hypothesis.fit.log_likelihood - within.log_likelihood)
+        return reason if lost > ANSWER_SET_DELTA_CHI2 * hypothesis.inflation else Remark()
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
         """Whether a set is better than a smaller one, by default the best of one effect fewer, by at least the
@@ -359,11 +380,12 @@ def adequate_hypotheses(
         if not hypothesis.credible or not (hypothesis.plausible or fits_best):
             rejected[hypothesis.label] = hypothesis.reason
             continue
+        if reason := search.implausible(hypothesis):
+            rejected[hypothesis.label] = reason
+            continue
         tests = search.tests_after(hypothesis.fit)
         hypothesis = replace(hypothesis, fit=tests.fit)
-        # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
-        # first round, which rejects more readily.
-        if tests.rejects_model or (len(hypothesis.effects) > 1 and tests.any_exceeds(FALSE_ALARM_LEVEL_FIRST_ROUND)):
+        if tests.rejects_model:
             rejected[hypothesis.label] = MISFIT_REMAINS
         elif len(hypothesis.effects) > 1 and (reason := search.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
