@@ -84,8 +84,8 @@ class ExperimentError(UserError):
 
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
-    """Format problems, errors first, as at most `limit` lines; the last counts the rest. Those that differ only in trial,
-    line and measured number are one, and cells beyond the same bound of a column.
+    """Format problems, errors first, as at most `limit` lines; the last counts the rest. Those that differ only in
+    trial, line and measured number are one, and cells beyond the same bound of a column.
     """
     groups: dict[Problem, list[Problem]] = {}
     for problem in sorted(problems, key=lambda problem: ("error", "warning", "note").index(problem.severity)):
