@@ -115,7 +115,8 @@ def _noise(track: Track) -> tuple[Floats, float]:
     y = track.lead_position_m[rows]
     speed, _, larger = _steps(np.arange(float(y.size)), y)
     # 0.1: part of the highest speed from which a step is one of a motion (chosen)
-    single = np.append(True, (speed >= SHORT_STEP * larger) | ~(larger > 0.1 * np.nanmax(larger, initial=0.0)))
+    moves = larger > 0.1 * np.nanmax(larger, initial=0.0)
+    single = np.append(True, (speed >= SHORT_STEP * larger) | ~moves)[: y.size]
     rounding_m, kept, y = rounding_noise(y), rows[single], y[single]
     whole_m, rho = position_noise(track.time_s[kept], y, robust=True)
     whole_m = max(whole_m, rounding_m)
