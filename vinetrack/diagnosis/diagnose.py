@@ -326,7 +326,7 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     # 0.125: the largest fraction that may be outliers (chosen)
     kept, most, far, count = np.arange(len(data)), max(2, int(0.125 * len(data))), list[int](), 0
     while len(far) <= most:
-        residual, allowed, deviates = _deviates(curves, log_force, kept)
+        *_, deviates = _deviates(curves, log_force, kept)
         worst = int(np.argmax(deviates[kept]))
         far.append(int(kept[worst]))
         count = len(far) if deviates[far[-1]] > 1 else count
@@ -355,14 +355,13 @@ def _deviates(curves: Floats, log_force: Floats, kept: NDArray[np.intp]) -> tupl
     """
     inverse = np.linalg.pinv(curves[kept])
     residual, degrees = log_force - curves @ (inverse @ log_force[kept]), max(kept.size - curves.shape[1] - 1, 1)
-    left = np.zeros(residual.size)
-    left[kept] = np.clip(1 - np.sum(curves[kept] * inverse.T, axis=1), 1e-9, None)  # of a trial's own deviation
-    of_others = (np.sum(residual[kept] ** 2) - residual**2 / np.maximum(left, 1e-9)) / degrees
+    shown, square = np.ones(residual.size), np.sum(residual[kept] ** 2)
+    shown[kept] = np.maximum(1 - np.sum(curves[kept] * inverse.T, axis=1), 1e-9)  # part of a deviation that is left
     # 0.02: least scatter of ln F, that of careful trials (chosen)
-    scatter = np.sqrt(np.maximum(of_others, 0.02**2))
+    of_others = np.sqrt(np.maximum((square - residual**2 / shown) / degrees, 0.02**2))
     quantile = -float(stdtrit(degrees, CHANCE / (2 * kept.size)))
-    allowed = quantile * max(math.sqrt(np.sum(residual[kept] ** 2) / (degrees + 1)), 0.02)
-    return residual, allowed, np.abs(residual) / np.sqrt(np.maximum(left, 1e-9)) / scatter / quantile * (left > 1e-6)
+    allowed = quantile * max(math.sqrt(square / (degrees + 1)), 0.02)
+    return residual, allowed, np.abs(residual) / np.sqrt(shown) / of_others / quantile * (shown > 1e-6)
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:
