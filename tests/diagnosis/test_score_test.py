@@ -282,11 +282,25 @@ def test_an_implausible_size_is_believed_where_no_other_is_plausible():
 def test_an_implausible_size_is_not_believed_where_one_beyond_belief_fits_better():
     """A gas of 2.5 times its density was named for a drag that was ten times the largest known."""
     far, tests = replace(hypothesis("air_drag", -100.0), plausible=False), SimpleNamespace(rejects_model=False, fit=1)
-    search = SimpleNamespace(tests_after=lambda _: tests, implausible=lambda _: Remark())
-    for log_likelihood, named in ((-99.0, []), (-101.0, ["air_drag"])):
+    for log_likelihood, code, named in ((-99.0, "", []), (-101.0, "", ["air_drag"]), (-101.0, "implausible_size", [])):
+        search = SimpleNamespace(tests_after=lambda _: tests, implausible=lambda _, code=code: Remark(code))
         further = replace(hypothesis("inlet_loss", log_likelihood), plausible=False, credible=False)
         found, *_ = selection.adequate_hypotheses([far, further], search)
         assert [one.label for one in found] == named
+
+
+def test_an_effect_is_fitted_from_its_usual_values_too_and_never_twice_from_the_same(monkeypatch):
+    """Without bends in the sheet nothing depends on μ_c; from a fifth of its size capstan friction ended at none."""
+    effect, starts = catalogue()["capstan_friction"], []
+    others = [(mu, k) for k in (10.0, 3.0, 17.0) for mu in (0.3, 1.0, 1.7)]
+    products = SimpleNamespace(shapes=[misfit_tests.CandidateShape(effect, other, 1e-3) for other in others])
+    known = {"predicted_gains": np.repeat([9.0, 8.0, 7.0], 3), "scores": SimpleNamespace(size=np.full(9, 0.01))}
+    told = {"ranked_shapes": lambda _: range(9), "predicted_gain": lambda _: 9.0}
+    fit = SimpleNamespace(model=vt.base_model(), log_likelihood=-100.0)
+    monkeypatch.setattr(selection, "full_fit", lambda *_, start, **__: starts.append(start.get("capstan_friction.k")))
+    search = selection.Search(SimpleNamespace(fit=fit), str)
+    search._fit_from_prediction(SimpleNamespace(products=products, fit=fit, **known, **told), (), "capstan_friction")
+    assert starts == [10.0, 3.0, None]
 
 
 @pytest.mark.parametrize(("within", "code"), [(-103.0, ""), (-106.0, "implausible_size"), (None, "implausible_size")])
