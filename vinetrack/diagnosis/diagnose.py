@@ -322,7 +322,7 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     log_force = np.log(np.maximum(force_N, 1e-9))
     log_speed = np.log([middle_speed(trial_data) for trial_data in data])
     log_speed -= np.median(log_speed)
-    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2]).astype(float)
+    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
     # 0.125: the largest fraction that may be outliers (chosen)
     kept, most, far, count = np.arange(len(data)), max(2, int(0.125 * len(data))), list[int](), 0
     while len(far) <= most:

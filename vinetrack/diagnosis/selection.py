@@ -75,7 +75,7 @@ FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit ha
 
 MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
 
-STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
+STARTS_PER_EFFECT = 2  # Shapes of an effect from which it is fitted, before its usual values (chosen)
 
 Names = frozenset[str]
 
@@ -147,7 +147,7 @@ class Search:
         for index in tests.ranked_shapes(name):  # A size that differs between vines is fitted so from any start.
             if all(shapes[k].other_values != shapes[index].other_values for k in by_gain.values()):
                 by_gain.setdefault(round(float(tests.predicted_gains[index]), 3), index)
-        of_gain = list(by_gain.values())[: STARTS_PER_EFFECT - 1]
+        of_gain = list(by_gain.values())[:STARTS_PER_EFFECT]
         starts = [start_values(shapes[index], float(tests.scores.size[index])) for index in of_gain]
         effect = shapes[of_gain[0]].effect
         for start in [*starts, {}] if len(effect.parameters) > 1 else starts:
