@@ -185,25 +185,3 @@ def test_a_sheet_that_contradicts_its_films_comes_before_the_verdict(filmed, tmp
     assert diagnosis["next_experiment"] is None
     assert "diameter_mm" in lines[-1]
     assert run("propose", results).exit_code == 1
-
-
-@pytest.mark.real
-def test_a_falling_ball_gives_g_through_the_whole_chain(real, tmp_path):
-    folder = tmp_path / "fall"
-    folder.mkdir()
-    shutil.copy(real / "freefall_1000fps" / "freefall.mp4", folder)
-    (folder / "trials.csv").write_text(
-        "trial,video,diameter_mm,travel_ratio,mm_per_px,capture_fps\nball,freefall.mp4,20,1,0.27307,1000\n"
-    )
-    (folder / "experiment.yaml").write_text("candidates: [air_drag]\n")
-    small = ("figures={formats: [png]}", "overlays={of: none}")
-    done = snakemake(tmp_path, "--cores", "2", "--config", "experiment=fall", *small)
-    assert done.returncode == 0, done.stdout + done.stderr
-    row = read_rows(tmp_path / "results" / "fall" / "trials.csv")["ball"]
-    assert row["status"] != "failed", row["reason"]
-    track = pd.read_csv(tmp_path / "results" / "fall" / "tracks" / "ball.csv", keep_default_na=False)
-    flags = track["flag"].str.split(";")
-    falling = ~flags.map({"before_release", "lost", "rejected", "duplicate", "after_end"}.intersection).astype(bool)
-    assert falling.sum() > 150
-    time_s, fallen_m = (track.loc[falling, name].astype(float) for name in ("time_s", "lead_position_m"))
-    assert 9.5 < 2 * np.polyfit(time_s, fallen_m, 2)[0] < 9.7

@@ -28,19 +28,6 @@ def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_
     assert not re.search(r"https?://|file:|^--|^-[a-z]|/", lock + docs, flags=re.MULTILINE)
 
 
-def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there():
-    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8"))["jobs"]
-    assert PROJECT["requires-python"] == f">={jobs['tests']['strategy']['matrix']['python'][0]}"
-    run = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
-    for path in re.findall(r"[\w./-]+\.(?:py|lock)\b", run):
-        assert (ROOT / path).is_file(), path
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    for line in re.findall(r"^make (.+)$", run, re.MULTILINE):
-        assert set(line.split()) <= targets
-    for named in re.findall(r'"\.\[(.+?)\]"', run):
-        assert set(named.split(",")) <= set(EXTRAS)
-
-
 @pytest.mark.parametrize("profile", ["default", "slurm"])
 def test_profiles_hold_options_that_snakemake_knows_and_rules_that_are_there(profile):
     from snakemake.cli import get_argument_parser

@@ -18,9 +18,6 @@ from hidden.laboratory_rows import campaign
 from hidden_truth import grown, sheet
 from lsoda_vine import as_track, small_campaign
 from own_effect import NAME, write_effect
-from tube.folder import write_folder
-from tube.models import fit_tubes, models, threshold_kPa
-from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark
@@ -370,7 +367,7 @@ def test_trials_that_only_the_initial_model_misses_by_far_are_no_reason_to_look_
     fit = replace(depleted.fits[0], left_out={"still": "it stands"})
     for limit, told in ((of_initial, False), (of_final, True)):
         monkeypatch.setattr("vinetrack.diagnosis.diagnose.LARGEST_MISSED", limit)
-        again = {note.code: note.facts for note in vt.diagnose(fit, ladder=False, advice=False).notes}
+        again = {note.code: note.facts for note in diagnosed(fit, FEW[:1]).notes}
         assert ("far_off" in again) == told
         assert again["not_in_the_fit"] == {"names": ["still"], "reason": "it stands"}
 
@@ -516,32 +513,6 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
     found = vt.diagnose(drops, model=vt.make_model(model), ladder=False, advice=False)
     assert found.verdict == verdict
     assert abs(found.fits[-1]["C_D"].value - 0.5) < 3 * found.fits[-1]["C_D"].sigma
-
-
-@pytest.mark.real
-def test_the_drag_of_eight_real_paper_cups_is_named(real):
-    found = vt.diagnose(real / "falling_cups", ladder=False, advice=False)
-    assert (found.verdict, found.effects) == ("missing", ("air_drag",))
-    assert found.fits[-1]["C_D"].value == pytest.approx(1.24, abs=0.03)
-
-
-@pytest.mark.real
-def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(real, tmp_path):
-    """Its authors fit a pressure to start above one to stop, and drag that rises with the length."""
-    sticking = [one for one in read_recordings(real / "everting_tube") if one.name == "tube2_hi_2"]
-    experiment = vt.read_experiment(write_folder(sticking, tmp_path))
-    # Whether a model is adequate is decided before any candidate is tried.
-    assert vt.diagnose(experiment, candidates=("tail_friction",), ladder=False, advice=False).verdict != "adequate"
-    named, mended = models(), "+ static_yield + tail_friction + reel_inertia"
-    before, after = (fit_tubes(name, named[name], experiment, sticking) for name in ("Eq. (2)", mended))
-    assert before.rms_m > 0.03
-    assert after.rms_m < before.rms_m / 2
-    assert after.fits["2"].chi2_per_dof > 100  # and it is still not what happened
-    # The slope of the friction alone is what the starts show: fits of nearly the same error, which rounding decides
-    # between, put the first start at 9.3 or 11.5 kPa where 12.1 was read off.
-    start, fit = thresholds(sticking[0], "start"), after.fits[sticking[0].tube]
-    slope = threshold_kPa(fit, "start", 1.0) - threshold_kPa(fit, "start", 0.0)
-    assert slope == pytest.approx(start[1], rel=1 / 3)
 
 
 def test_a_force_far_beyond_drive_and_weight_is_not_named():

@@ -13,7 +13,6 @@ from vinetrack.figures import damping_figures, motion_figures, overlay
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip
 from vinetrack.figures.style import RULE_COLOURS, look, render
-from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
@@ -227,9 +226,3 @@ def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_
     for line, at in zip((line for line in sheet.lines if line.get_linewidth() == 1.8), (20, 125, 223), strict=True):
         assert line.get_xdata() == pytest.approx([at, at])
         assert sorted(line.get_ydata()) == pytest.approx([15, 45])
-
-
-def test_a_strip_is_small_in_a_page():
-    body = inline_picture(render(draw_strip("a", tracking(900, 320), 1e-3), ["svg"])["svg"].decode(), "p", "strip")
-    assert len(body) < 60_000
-    assert "matrix(" in body

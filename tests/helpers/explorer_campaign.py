@@ -31,6 +31,8 @@ FEW_CANDIDATES = (
 """For tests that use a diagnosis; the last two cannot be tested with these trials. `tests/diagnosis` tests verdicts
 with the whole catalogue."""
 
+ROUGH_FIGURES = '{"figures": {"formats": ["png"], "dpi": 50}}'
+"""Settings of stages where nobody looks at the figures of single trials: they take half of the time."""
 SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
 
 
@@ -50,7 +52,7 @@ def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = S
 
 def make_results(experiment: Path, results: Path) -> Path:
     """The results of the workflow, as far as the explorer reads them."""
-    run("trials", experiment, results)
+    run("trials", experiment, results, "--settings", ROUGH_FIGURES)
     fit_law(experiment, results, damping={"resamples": 100})
     fit_model(Job(read_experiment(experiment), results, run_settings({})))
     made = {"experiment": experiment.absolute().as_posix(), "settings": {"damping": {"resamples": 100}}}

@@ -20,7 +20,7 @@ from bokeh.document import Document
 from bokeh.events import ButtonClick
 from chrome import until
 from commanded import run
-from explorer_campaign import DEMO, SETTINGS, SMALL, make_experiment, make_results, write_bars, write_diagnosis
+from explorer_campaign import DEMO, SETTINGS, write_bars, write_diagnosis
 from own_effect import write_effect
 from served import Served
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
@@ -32,7 +32,7 @@ from vinetrack.effects import Parameter, remember
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.laboratory.tracks import grow, read_ground_truth
-from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, predict_choice, slider_range
+from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server, suspects
 from vinetrack.pages.plots import RecordingView, decode, recording_view
 from vinetrack.results.folder_layout import Results, ResultsError
@@ -211,22 +211,6 @@ def test_after_unexplained_the_command_is_named_and_an_effect_of_ones_own_is_sav
     settings = read_experiment_settings(folder / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path):
-    """No point of a doubtful rest is fitted, but it still determines the origin."""
-    experiment = make_experiment(tmp_path / "vines", SMALL[:4])
-    for path in (experiment / "tracks").iterdir():
-        table = pd.read_csv(path)
-        table.assign(sigma_m=np.where(table["time_s"] < 0.015, 2e-3, 1e-4)).to_csv(path, index=False)
-    door = open_campaign(make_results(experiment, tmp_path / "results"))
-    table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
-    prediction = predict_choice(door, choice_in_use(door))
-    for seen, predicted in zip(door.trials, prediction.trials, strict=True):
-        assert seen.data.imprecise_rest is not None
-        assert predicted.origin_m == pytest.approx(seen.origin_m, abs=1e-12)
-    assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
 
 
 def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(campaign, tmp_path):

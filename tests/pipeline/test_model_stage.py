@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commanded import fit_law, succeed
-from explorer_campaign import make_results
+from explorer_campaign import ROUGH_FIGURES, make_results
 from lsoda_vine import small_campaign
 from test_pipeline import MODEL_HEADERS
 
@@ -92,7 +92,7 @@ def tracked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("askew")
     pairs = [(replace(trial, name=f"t{k}"), track) for k, (trial, track) in enumerate(small_campaign(seed=23)[0][:7])]
     experiment = write_experiment(folder / "vines", pairs, [90] * 5 + [0] * 2)
-    succeed("trials", experiment, folder / "results")
+    succeed("trials", experiment, folder / "results", "--settings", ROUGH_FIGURES)
     return experiment, folder / "results"
 
 

@@ -305,6 +305,7 @@ def chrome(tmp_path_factory):
         yield browser
 
 
+@pytest.mark.slow
 def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome, address):
     chrome.open(address)
     assert chrome.complaints == []
@@ -316,6 +317,7 @@ def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome,
     assert chrome.run("document.querySelector('video').duration") == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(chrome, address):
     for width, height in ((1400, 900), (768, 900), (390, 844)):
         chrome.size(width, height)
@@ -327,6 +329,7 @@ def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(
         assert chrome.run(f"document.querySelector('{what}').getBoundingClientRect().bottom") < 844
 
 
+@pytest.mark.slow
 def test_page_and_pictures_follow_a_dark_screen(chrome, address):
     ask = {
         "page": "getComputedStyle(document.body).backgroundColor",
@@ -346,6 +349,7 @@ def test_page_and_pictures_follow_a_dark_screen(chrome, address):
     assert dark["page"] < dark["grid"] < dark["text"]
 
 
+@pytest.mark.slow
 def test_it_prints_in_dark_on_light_whatever_the_screen(chrome, address):
     features = [{"name": "prefers-color-scheme", "value": "dark"}]
     chrome.send("Emulation.setEmulatedMedia", media="print", features=features)

@@ -1,7 +1,6 @@
 """The leading edge and its stated errors against the truth of recordings drawn by other code; seeds of their own."""
 
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -26,7 +25,7 @@ from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import Look, calibrated_sigma, cut_strip
+from vinetrack.video.strip import Look, Positions, Tracker, calibrated_sigma, cut_strip
 from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, moving_range, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -74,25 +73,17 @@ def test_edge_of(name):
     assert 0.45 < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
 
 
-STRANGER = """
-import numpy as np
-from vinetrack.video.strip import Look, Positions, Tracker, cut_strip
-
 class MiddleTracker(Tracker):
-    def follow(self, look: Look) -> Positions | None:
-        if look.travel_ratio != 2:
-            return None
+    """An edge at 2 px a frame, whatever is in the picture."""
+
+    def follow(self, look: Look) -> Positions:
         strip, n = cut_strip(look.luma, look.axis, 10.0), len(look.luma)
-        edge = 100.0 + 2.0 * np.arange(n)
-        return Positions(strip=strip, edge_px=edge, sigma_px=np.full(n, 0.1), unsure=np.zeros(n, bool),
-                         reach_px=1.0, slow_px=0.0)
-"""
+        sure = {"sigma_px": np.full(n, 0.1), "unsure": np.zeros(n, bool), "reach_px": 1.0, "slow_px": 0.0}
+        return Positions(strip=strip, edge_px=100.0 + 2.0 * np.arange(n), **sure)
 
 
-def test_another_tracker_is_a_file_of_its_own_and_a_name_in_the_registry(tmp_path, monkeypatch):
-    (tmp_path / "stranger.py").write_text(STRANGER, encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(track, "TRACKERS", [import_module("stranger").MiddleTracker(), *track.TRACKERS])
+def test_another_tracker_is_a_class_of_its_own_in_the_registry(monkeypatch):
+    monkeypatch.setattr(track, "TRACKERS", [MiddleTracker(), *track.TRACKERS])
     scene, tracking = followed()
     assert tracking.track.edge_px == pytest.approx(100.0 + 2.0 * np.arange(len(scene.frames)))
     assert with_flag(tracking.track.flag, "before_release").sum() < 3

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -67,16 +66,7 @@ def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path, name)
     assert [(one.code, one.severity) for one in check_experiment(tmp_path, Surveyor())] == [("cut_short", "error")]
 
 
-def test_a_rate_that_contradicts_the_frames_own_is_refused(tmp_path, monkeypatch):
-    write_clip(tmp_path / "a.mp4")
-    inspect = module.inspect_recording
-    monkeypatch.setattr(module, "inspect_recording", lambda path: replace(inspect(path), capture_fps=1069.0))
-    assert check(tmp_path, "a.mp4") == ["error t0 capture_fps"]
-
-
 BOARD = "calibration: {kind: checkerboard, image: board.png, squares: [5, 5], square_mm: 5}\n"
-
-
 NO_SCALES = {
     "no scale": ("", None, "error calibration"),
     "no picture": (BOARD, None, "error calibration.image"),
@@ -178,13 +168,6 @@ FILMED = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px,
 RIGHT = "12,100,140,36,3"
 
 
-def test_a_missing_scale_is_said_with_what_to_do(tmp_path):
-    opened = {Trial(name="a", pressure_Pa=3e4): SimpleNamespace(width=96, height=40)}
-    (problem,), _ = module._scale_problems(SimpleNamespace(calibration=None, axis=None), tmp_path, opened)
-    assert (problem.code, problem.column) == ("missing", "calibration")
-    assert "is missing" in problem.reason
-
-
 @pytest.mark.slow
 def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
     """Of two trials, the second of which has a scale of its own."""
@@ -214,12 +197,10 @@ def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
     [
         (RIGHT, FILMED.replace("1069", "60"), ["error t0 capture_fps"]),
         (RIGHT, FILMED.replace("0.24", "0.024"), ["error t0 diameter_mm"]),
-        (RIGHT, FILMED.replace("0.24", "0.288"), ["warning t0 diameter_mm"]),
-        ("140,100,12,36,3", FILMED, ["error t0 diameter_mm", "error t0 length_mm"]),
         (RIGHT, FILMED + "exposure_us: 0.0935\n", ["warning exposure_us", "warning t0 exposure_us"]),
         (RIGHT, FILMED + "exposure_ms: 93.5\n", ["note exposure_ms", "error t0 exposure_us"]),
     ],
-    ids=["rate", "scale ×10", "scale 20 %", "sizes swapped", "ms as µs", "µs as ms"],
+    ids=["rate", "scale ×10", "ms as µs", "µs as ms"],
 )
 def test_check_catches_a_mistake(clip, tmp_path, row, settings, expected):
     (tmp_path / "a.mp4").symlink_to(clip)
