@@ -114,16 +114,25 @@ def test_the_python_on_the_page_runs():
 
 
 # docs/own_effect.md: its effect and settings work as they stand there.
-def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_provenance(tmp_path):
-    experiment, results = tmp_path / "mine", tmp_path / "results"
-    write_effect(one_vine(experiment))
-    (experiment / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
+@pytest.fixture
+def with_own_effect(tmp_path):
+    write_effect(one_vine(tmp_path / "mine"))
+    (tmp_path / "mine" / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
+    return tmp_path / "mine"
+
+
+def test_its_effect_is_printed_as_shown(with_own_effect):
     shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
     assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
-    said = run("effects", "spring_line", "--experiment", experiment).stdout
-    assert said.strip().replace(str(experiment), "my_experiment") == shown.output
+    said = run("effects", "spring_line", "--experiment", with_own_effect).stdout
+    assert said.strip().replace(str(with_own_effect), "my_experiment") == shown.output
+
+
+@pytest.mark.slow
+def test_its_effect_goes_through_every_stage_into_the_provenance(with_own_effect, tmp_path):
+    results = tmp_path / "results"
     for stage in STAGES:
-        succeed(stage, experiment, results, "--settings", '{"figures": {"dpi": 50}}')
+        succeed(stage, with_own_effect, results, "--settings", '{"figures": {"dpi": 50}}')
     assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
     assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]
 

@@ -19,7 +19,7 @@ from hand_sheet import two_vines
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from plain_scene import write_video
-from test_pipeline import write_track
+from test_pipeline import SHEET, write_track
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
@@ -34,7 +34,6 @@ from vinetrack.tracks.importers import read_pressure_trace, read_track
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.track import track_recording
 
-HEADER = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 NO_FILES = dict.fromkeys(("pipe", "zero"), "a pipe or a device") | {"folder": "a folder", "shut": "permission denied"}
 
 
@@ -48,7 +47,7 @@ def vines(tmp_path, monkeypatch):
     (folder / "folder").mkdir()
     (folder / "shut").write_text("time_s,position_m\n")
     rows = [f"{name},{name}{'.csv' if name == 'good' else ''},12,100,300,20,3,0\n" for name in ("good", *NO_FILES)]
-    (folder / "trials.csv").write_text(HEADER + "".join(rows))
+    (folder / "trials.csv").write_text(SHEET + "".join(rows))
     allowed = os.access
     # Who runs the tests may be allowed to read everything.
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "shut" and allowed(path, mode))
@@ -111,7 +110,7 @@ def _experiment(folder: Path, place: str, kind: str) -> None:
     rate = "1000" if column == "video" else ""
     trace = name if place == "pressure trace" else ""
     scale = "" if setting.startswith("image") else "0.3"
-    header = HEADER.replace("track,", f"{column},pressure_trace,mm_per_px,capture_fps,")
+    header = SHEET.replace("track,", f"{column},pressure_trace,mm_per_px,capture_fps,")
     (folder / "trials.csv").write_text(f"{header}bad,{value},{trace},{scale},{rate},12,100,300,20,3,0\n")
     if setting.startswith("image"):
         setting = f"calibration: {{kind: checkerboard, {setting}, squares: [5, 4], square_mm: 10}}"

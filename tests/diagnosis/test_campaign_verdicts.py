@@ -319,7 +319,7 @@ def depleted(depleted_pairs):
 
 
 def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said():
-    nothing_missing = vt.diagnose(grown(seed=7000))
+    nothing_missing = diagnosed(grown(seed=7000))
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
     ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}

@@ -209,7 +209,7 @@ def test_the_lens_adds_to_the_error_what_is_said_to_be_its_part():
 
 
 def test_what_trials_share_stays_where_their_number_grows():
-    few, many = fitted(replicates=2), fitted(replicates=8)
+    few, many = fitted(replicates=2), fitted(replicates=5)
     for one, other in zip(few.numbers, many.numbers, strict=True):
         assert other.shared["set pressures"] >= one.shared["set pressures"]
         assert other.sigma < one.sigma

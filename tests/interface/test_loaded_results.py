@@ -10,7 +10,7 @@ from shutil import copytree
 import notebook
 import pandas as pd
 import pytest
-from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results, run
+from explorer_campaign import FEW_CANDIDATES, ROUGH_FIGURES, SETTINGS, SMALL, make_experiment, make_results, run
 from matplotlib.figure import Figure
 
 import vinetrack as vt
@@ -30,8 +30,8 @@ def small_run(tmp_path_factory):
     experiment = make_experiment(folder / "demo", SMALL, SETTINGS + FEW_CANDIDATES)
     results = folder / "results" / "demo"
     make_results(experiment, results)
-    run("model", experiment, results)
-    run("report", experiment, results)
+    for stage in ("model", "report"):
+        run(stage, experiment, results, "--settings", ROUGH_FIGURES)
     return results
 
 
