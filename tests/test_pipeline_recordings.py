@@ -160,16 +160,6 @@ def test_the_report_links_to_strips_and_shows_calibration_and_a_clip_of_every_co
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
 
-def test_check_says_of_the_same_folder_what_is_wrong(filmed):
-    done = run("check", filmed.results.parents[1] / "vines")
-    assert done.exit_code == 1
-    lines = [line for line in done.output.splitlines() if line.startswith(("error", "warning"))]
-    assert [next(name for name in BAD if f"trial {name}" in line) for line in lines] == [
-        "gone", "beheaded", "letter", "part",
-    ]  # fmt: skip
-    assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
-
-
 def test_a_sheet_that_contradicts_its_films_comes_before_the_verdict(filmed, tmp_path):
     """A tube that is 12 mm wide in the pictures, and 14 mm in the sheet of another folder."""
     films, folder, results = filmed.results.parents[1] / "vines", tmp_path / "wide", tmp_path / "out" / "wide"
