@@ -2,8 +2,13 @@
 written out by hand."""
 
 import math
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +29,7 @@ from by_hand import (
 from hidden import EFFECTS
 from hidden.verify import FRAME_S, SIZES, ours, trials
 from numba import njit
+from own_effect import NAME, write_effect
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 import vinetrack as vt
@@ -62,6 +68,7 @@ def test_two_simulators_agree(effect):
         np.testing.assert_allclose(other[seen], theirs[seen], atol=1e-8)
 
 
+PACKAGE = Path(vt.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 
 
@@ -97,6 +104,34 @@ def test_each_effect_and_all_together(name, vine):
     terms = audit.evaluate(model, trial, time, y, v)
     chamber = terms.pressure_Pa if name == "supply_refill" else None
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
+
+
+FALL = f"""
+import numpy as np
+import vinetrack as vt
+from vinetrack.core.records import Trial
+trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
+model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
+model += vt.effects.own_effects(["{NAME}.py"])["{NAME}"]
+print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
+"""
+
+
+@pytest.mark.slow
+def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_path):
+    copy, cache = tmp_path / "elsewhere", tmp_path / "cache"
+    shutil.copytree(PACKAGE, copy / "vinetrack", ignore=shutil.ignore_patterns("__pycache__"))
+    said, compiled = [], []
+    for place in (PACKAGE.parent, copy):
+        folder = tmp_path / f"with_{place.name}"
+        folder.mkdir()
+        write_effect(folder)
+        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache), "NUMBA_CACHE_DIR": ""}
+        said.append(subprocess.check_output([sys.executable, "-c", FALL], env=environment, cwd=folder))
+        compiled.append(sorted((path.name, path.stat().st_mtime_ns) for path in cache.rglob("kernel_*")))
+    assert said[0] == said[1]
+    assert compiled[0] == compiled[1]
+    assert any(name.endswith(".nbc") for name, _ in compiled[0])
 
 
 @pytest.mark.parametrize("tau", [1e-4, 0.02, 1.0])

@@ -353,32 +353,33 @@ def test_noise_has_the_variance_of_shot_and_read_noise():
     assert frames.var(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.01)
 
 
+def test_lamps_flicker_by_what_is_left_after_the_exposure():
+    light = Light(flicker=0.2, flicker_Hz=100.0, vignetting=0)
+    shots = renderer(replace(CLEAN, light=light), np.zeros_like, exposure_s=9e-4, n_frames=100)
+    levels = np.array([shots.frame(index)[:20, 400:].mean() for index in range(0, 100)]) / 6553.5
+    spectrum = np.abs(np.fft.rfft(levels - 1)) / 50
+    begin_s = np.arange(20000) * 9e-4 / 20000
+    left = abs(np.exp(2j * np.pi * 100 * begin_s).mean())
+    assert spectrum[10] == pytest.approx(0.2 * left, rel=1e-3)
+    assert np.delete(spectrum, 10).max() < 1e-3
+
+
 def test_same_seed_same_pictures_other_seed_others():
     one, again, other = (renderer(replace(preset("demo"), camera=SMALL), seed=seed).frame(20) for seed in (4, 4, 5))
     assert (one == again).all()
     assert (one != other).mean() > 0.5
 
 
-DEMO = replace(preset("demo"), camera=Camera(width_px=320, height_px=128))
-SETTINGS = {"n_frames": 24, "capture_fps": 1069.0, "seed": 7}
-
-
-def film(scene: Scene, path):
-    return render_recording(scene, steadily(2.0, 0.005), out_path=path, **SETTINGS)
-
-
-def rendered(scene: Scene, index: int) -> np.ndarray:
-    return FrameRenderer(scene, steadily(2.0, 0.005), **SETTINGS).frame(index)
-
-
 def test_h264_holds_every_frame_at_the_rendered_levels_in_the_limited_range(tmp_path):
-    truth = film(replace(DEMO, encoding=Encoding(gop=8)), tmp_path / "trial.mp4")
+    scene = replace(preset("demo"), camera=Camera(width_px=320, height_px=128), encoding=Encoding(gop=8))
+    shot = {"n_frames": 24, "capture_fps": 1069.0, "seed": 7}
+    truth = render_recording(scene, steadily(2.0, 0.005), out_path=tmp_path / "trial.mp4", **shot)
     with av.open(str(tmp_path / "trial.mp4")) as container:
         assert float(container.streams.video[0].average_rate) == pytest.approx(60)
         frames = list(container.decode(video=0))
     assert len(frames) == truth.time_s.size == 24
     assert [index for index, frame in enumerate(frames) if frame.key_frame] == [0, 8, 16]
-    levels = 16 + 219 * rendered(DEMO, 10).astype(float) / 255
+    levels = 16 + 219 * FrameRenderer(scene, steadily(2.0, 0.005), **shot).frame(10).astype(float) / 255
     error = frames[10].to_ndarray(format="yuv420p")[:128] - levels
     assert abs(error.mean()) < 0.2
     assert 10 * np.log10(219**2 / (error**2).mean()) > 36

@@ -153,9 +153,8 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
         assert found is not None
         pictures = {name: figure for name in figures_of(*DIAGNOSIS_SECTIONS) if (figure := draw(name, found))}
         assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
-        for name, figure in pictures.items():
-            assert render(figure, ["svg"])["svg"]
-            assert len(getattr(found, figures_of(*DIAGNOSIS_SECTIONS)[name].data)) > 0
+        assert all(len(getattr(found, figures_of(*DIAGNOSIS_SECTIONS)[name].data)) > 0 for name in pictures)
+    assert all(render(figure, ["svg"])["svg"] for figure in pictures.values())
     for name, content in (("none", None), ("refused", refused())):
         assert drawn.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
     assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*DIAGNOSIS_SECTIONS))

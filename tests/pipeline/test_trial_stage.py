@@ -167,7 +167,7 @@ def test_every_item_is_answered_and_workers_of_a_killed_run_end_too(tmp_path):
 
 @pytest.mark.slow
 def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_metres(tmp_path, monkeypatch):
-    scene = plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
+    scene = plain_scene(PLAN)
     clip = write_video(tmp_path / "vine.mp4", scene.frames, options={"crf": "12"})
     drawn: list[Tracking] = []
     monkeypatch.setattr(clips, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))

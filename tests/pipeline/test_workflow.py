@@ -31,11 +31,6 @@ def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,1
     return one_vine(folder, rows, ",use")
 
 
-def filmed(folder: Path) -> None:
-    (folder / "a.mp4").write_bytes(b"film")
-    (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
-
-
 def planned(folder: Path, **config: object) -> workflow.WorkflowPlan:
     return workflow.make_plan({"experiment": str(folder), **config}, folder.parent)
 
@@ -145,7 +140,8 @@ def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
 
 def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path):
     folder = experiment(tmp_path / "v")
-    filmed(folder)
+    (folder / "a.mp4").write_bytes(b"film")
+    (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
     (folder / "experiment.yaml").write_text("published: measured\n")
     plan = planned(folder)
     known = set(plan.files("<measurements>"))
