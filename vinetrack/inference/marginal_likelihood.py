@@ -465,6 +465,8 @@ def estimate_between_trial_sd(
     def best_of(spreads: Floats) -> tuple[Floats, float]:
         spreads = np.where(estimable, np.clip(spreads, LEAST_BETWEEN_TRIAL_SD, largest), state.spread)
         found = deviances(part, problem, state, spreads, restricted=restricted)
+        if restricted:
+            found -= 2 * np.sum(np.log(spreads), axis=1, where=estimable)
         return spreads[np.argmin(found)], float(found.min())
 
     current, at_current = best_of(np.array([state.spread]))
