@@ -12,12 +12,14 @@ from hidden_truth import grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import ladder, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis.selection import slack_fit
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference import systematics
+from vinetrack.inference.fit_result import EXPONENT
 from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
@@ -110,6 +112,11 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
     assert selection.confounders_of(after, ["air_drag"]) == ()
+    # Of the base model n alone, which a gauge that is off would move too.
+    of_n = {one.effect: one for one in selection.confounders_of(after, BASE_EFFECTS)}
+    assert {one.parameter for one in of_n.values()} == {EXPONENT}
+    n, by_gauge = after.fit[EXPONENT], of_n["pressure_gauge"]
+    assert by_gauge.low_95 < n.low < n.high < by_gauge.high_95
 
 
 @pytest.mark.parametrize(

@@ -137,8 +137,8 @@ def test_the_restricted_likelihood_adds_the_information():
     assert restricted - plain == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
 
 
-def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
-    """So is the error of the common level, which is that of a mean of trials."""
+def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance_with_one_degree_of_freedom_less():
+    """σ^−ν exp(−νs²/2σ²) times σ has its maximum at s² ν/(ν − 1). So has the error of the common level."""
     n_trials, count, draw = 12, 25, np.random.default_rng(4)
     levels = 2.0 + 0.05 * draw.standard_normal(n_trials)
     own = np.tile([0.0, 0.0, 0.0, 1.0, 1.0], (count, 1))
@@ -149,8 +149,21 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
     part = marginal.marginal(cross_products, frame, state)
     found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))
     solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
-    assert found[1] == pytest.approx(math.sqrt(means.var(ddof=1) - 0.01**2 / 25), rel=2e-3)
-    assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
+    assert found[1] == pytest.approx(math.sqrt(means.var(ddof=2) - 0.01**2 / 25), rel=2e-3)
+    assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=2) / math.sqrt(12), rel=2e-3)
+
+
+def test_a_standard_deviation_between_trials_that_looks_like_none_is_within_its_error_of_none():
+    """Levels that scatter by their noise alone: the likelihood ends at 0, and σ would be known without an error."""
+    n_trials, count, draw = 12, 25, np.random.default_rng(4)
+    own = np.tile([0.0, 0.0, 0.0, 1.0, 1.0], (count, 1))
+    columns = [np.column_stack([own, 2.0 + 0.01 * draw.standard_normal(count)]) for _ in range(n_trials)]
+    frame, state = given(n_trials, count, 1, 0.3, rho=0.0, sigma=0.01)
+    part = marginal.marginal(crossed(columns), frame, state)
+    found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))[1]
+    at_it, at_none = marginal.deviances(part, frame, state, np.array([[1e-5, found], [1e-5, 1e-5]]))
+    assert 0.2 < at_it - at_none < 1
+    assert found > 1e-4
 
 
 @pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])

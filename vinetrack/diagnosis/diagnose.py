@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Floats, Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.core.units import GRAVITY_M_S2
+from vinetrack.core.units import BASE_EFFECTS, GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
@@ -43,7 +43,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.selection import Report, SelectionStep, select_effects
+from vinetrack.diagnosis.selection import Report, SelectionStep, confounders_of, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -164,6 +164,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
         explanation=in_words(step),
         slips=step.slips,
         cosines=Cosines(names, cosines.tolist()),
+        confounded=confounders_of(tests, BASE_EFFECTS) if step.verdict == ADEQUATE else step.confounded,
         fit=tests.fit,
         fits=tuple(one.fit for one in step.answer_set if one.effects[-1].kind != BETWEEN_TRIALS),
         sets=sets if any(len(effects) > 1 for effects in sets) else (),

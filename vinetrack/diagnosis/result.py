@@ -300,7 +300,9 @@ class Cosines(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class Round(JsonRecord):
-    """One model and its tests against all candidates. `ranking` has the best first, those not testable last."""
+    """One model and its tests against all candidates. `ranking` has the best first, those not testable last;
+    `confounded` are what sizes of added effects, or n of a model that is adequate, may include.
+    """
 
     model: tuple[str, ...] = ()
     verdict: str
@@ -311,6 +313,7 @@ class Round(JsonRecord):
     slips: Mapping[str, str] = field(default_factory=dict)
     ranking: tuple[StoredCandidate, ...] = ()
     cosines: Cosines = Cosines()
+    confounded: tuple[Confounder, ...] = ()
     fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None
     fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
     partial_fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()

@@ -16,6 +16,7 @@ from functools import cached_property, partial, reduce
 import numpy as np
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
@@ -56,7 +57,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import Model, Value, probe
 from vinetrack.effects import Effect, Parameter
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import EXPONENT, Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import assemble
@@ -396,30 +397,32 @@ def adequate_hypotheses(
 
 
 # ------------------------------------------------------------------------------
-# How much of a fitted size may belong to another, undetected effect: "this K includes up to … of drag".
+# How much of a fitted size, or of n, may belong to another, undetected effect: "this K includes up to … of drag".
 #
-# Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent.
-# If another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
+# Once a model is adequate, the other candidates are too weak to be detected, but not zero: air is never absent, and a
+# gauge never perfect. If another effect were present with size s, a fitted θ would fall by L s, with L = I_θθ⁻¹ I_θs the
 # coefficient of omitted-variable bias of the linear fit (`Scores.levers`). s may be anything up to its upper limit, or
 # to the end of its plausible range where that is nearer: the interval stated is the hull of the fit's own and of that
 # one shifted. Effects are considered one at a time and to first order.
 
 
-def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
-    """Find, for each size of the added effects, the physical effects that it may include, each in the shape that shifts
-    it most. Returns for each size, those that could shift it by more than its standard error, the largest first.
+def confounders_of(after: MisfitTests, names: Sequence[str]) -> tuple[Confounder, ...]:
+    """Find, for each size of effects that were added, the physical effects that it may include, and for n, faults of
+    the measurement too, each in the shape that shifts it most. Returns for each those that could shift it by more than
+    its standard error, the largest first.
     """
     shapes, chosen = after.products.shapes, list[Confounder]()
     of_numbers = zip(after.fit.numbers, after.fit.predictor.layout.free, after.scores.levers, strict=False)
     for number, free, scaled in of_numbers:
         name, lever = number.key.split(".")[0], scaled * free.derivative(number.value)
-        if name not in added or not 0 < number.sigma < math.inf:
+        is_size = name not in BASE_EFFECTS
+        if name not in names or not (is_size or number.key == EXPONENT) or not 0 < number.sigma < math.inf:
             continue
         largest: dict[str, tuple[float, Confounder]] = {}
         for k, shape in enumerate(shapes):
             # An effect that contains the added one as a limit is an alternative to it, no confounder.
             effect, sigma = shape.effect, float(after.scores.sigma[k])
-            alternative = effect.kind != "physical" or name in effect.replaces
+            alternative = (is_size and effect.kind != "physical") or name in effect.replaces
             if alternative or not effect.parameters or shape.whole or not math.isfinite(sigma):
                 continue
             possible = sizes_not_excluded(float(after.scores.size[k]), sigma, shape.size)

@@ -456,7 +456,9 @@ def estimate_between_trial_sd(
     """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search. The
     likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from the
     best of a grid and the current values; these stay where others are hardly likelier, since along the valley between
-    pressure and B the maximum moves far with every step of a fit.
+    pressure and B the maximum moves far with every step of a fit. The restricted likelihood is multiplied by each
+    standard deviation, so that none ends at 0, where its own error would count for nothing (Chung et al., Psychometrika
+    78, 685, 2013: about one standard error from 0 then).
     """
     if not any(estimable):
         return state.spread

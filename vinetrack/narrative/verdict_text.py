@@ -235,7 +235,8 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     with_them = [f"with {known} in the model"] if law and known else []
     refuted = law and not fault and diagnosis.final_verdict not in (ADEQUATE, "")
     with_them += ["of a model that these trials refute"] if refuted else []
-    notes = [*(f"n 95 %: {bounds_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
+    within = [f"n 95 %: {bounds_text(p)}{_confounded_interval(diagnosis, p)}" for p in law[:1]]
+    notes = [*within, *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
 
@@ -384,8 +385,7 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     """The wider interval of a size that allows for effects the data do not exclude (hull); blank without any."""
     alike: list[Confounder] = []
     for entry in diagnosis.rounds:
-        rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
-        alike = [rival for rival in rivals if rival.parameter == size.key] or alike
+        alike = [rival for rival in entry.confounded if rival.parameter == size.key] or alike
     if not alike:
         return ""
     factor = size.shown[1]
