@@ -399,8 +399,8 @@ def adequate_hypotheses(
 # ------------------------------------------------------------------------------
 # How much of a fitted size, or of n, may belong to another, undetected effect: "this K includes up to … of drag".
 #
-# Once a model is adequate, the other candidates are too weak to be detected, but not zero: air is never absent, and a
-# gauge never perfect. If another effect were present with size s, a fitted θ would fall by L s, with L = I_θθ⁻¹ I_θs the
+# Once a model is adequate, the other candidates are too weak to be detected, but not zero: air is never absent, a gauge
+# never perfect. If another effect were present with size s, a fitted θ would fall by L s, with L = I_θθ⁻¹ I_θs the
 # coefficient of omitted-variable bias of the linear fit (`Scores.levers`). s may be anything up to its upper limit, or
 # to the end of its plausible range where that is nearer: the interval stated is the hull of the fit's own and of that
 # one shifted. Effects are considered one at a time and to first order.
