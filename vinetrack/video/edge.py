@@ -311,10 +311,12 @@ ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found wh
 LEAST_FITTED_AMPLITUDE = 0.5
 
 
-def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> Floats:
-    """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
-    the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
-    more. Shapes: fit (n_frames, 5); chosen (n_frames,) → (n_frames, 5).
+def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cost: NDArray[np.float32]) -> Floats:
+    """Replace fits that break the motion or hardly fit by the best ones where the motion leads, unless the pixels
+    between the two, by the `cost` of an edge at each column, tell that the fit is right: frames are missing then, or
+    its neighbour is astray. Goes from the middle of the motion backwards and forwards. The edge never retreats, and a
+    step is at most 1.3 times its neighbour or 1.5 px more. Shapes: fit (n_frames, 5); chosen (n_frames,); cost
+    (n_frames, n_along) → (n_frames, 5).
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -324,7 +326,8 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
     decentrality = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
     anchor = int(moving[np.argmin(decentrality + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
-    edge = out[:, 0].tolist()
+    # Near the start a door passes for background, and only the motion tells.
+    edge, clear = out[:, 0].tolist(), fit[:, 0] >= clear_of_start(state.edge) + 0.5 * START_CLEARANCE_PX
     for sense in (-1, 1):
         for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
             previous, second, third = (edge[min(max(t - k * sense, 0), len(edge) - 1)] for k in (1, 2, 3))
@@ -339,20 +342,19 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
             found = search_edges(strip, state, np.full(len(places), t), places)
             seen = np.isfinite(found[:, 2]) & (found[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
             found = found[seen & (found[:, 0] >= low - 0.5) & (found[:, 0] <= high + 0.5)]
-            replacement = found[np.argmin(found[:, 2])] if len(found) else None
-            is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
-            ratio = abs(edge[t] - previous) / max(step, 1e-6)
-            if inside:
-                if replacement is not None and replacement[2] < out[t, 2]:
-                    out[t] = replacement
-            elif not faint and is_better and step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25:
-                continue  # two to four whole steps: frames are missing, and the point is right
-            elif replacement is None:
-                expected = previous if math.isnan(edge[t]) else edge[t]
-                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0)
+            if len(found):
+                replacement = found[np.argmin(found[:, 2])]
             else:
+                expected = previous if math.isnan(edge[t]) else edge[t]
+                replacement = np.array([min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0])
+            if inside:
+                replace_it = len(found) > 0 and replacement[2] < out[t, 2]
+            else:
+                own, there = np.clip(np.nan_to_num([edge[t], replacement[0]]), 0, cost.shape[1] - 1).astype(int)
+                replace_it = faint or not clear[t] or cost[t, there] < cost[t, own]
+            if replace_it:
                 out[t] = replacement
-            edge[t] = float(out[t, 0])
+                edge[t] = float(out[t, 0])
     return out
 
 
@@ -526,7 +528,7 @@ class EdgeTracker(Tracker):
         state, path, passed, exposure_frames = tube.state, tube.state.edge, tube.passed, look.exposure_frames
         exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
         for iteration in range(3):
-            before, path = path, _path_by_appearance(strip, state.appearance, passed)
+            before, (path, cost) = path, _path_by_appearance(strip, state.appearance, passed)
             # 1.0: two paths are the same if they nowhere differ by more than this (derived)
             if iteration > 0 and np.abs(before - path).max() <= 1.0:
                 break
@@ -547,7 +549,7 @@ class EdgeTracker(Tracker):
             if iteration > 0:
                 state = find_shading(strip, state, fit)
             steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
-            fit = repair_jumps(strip, state, fit_edges(strip, state, informative, steps), informative)
+            fit = repair_jumps(strip, state, fit_edges(strip, state, informative, steps), informative, cost)
             # 0.2: the iteration has converged once no edge of a moving frame changes by more than this (chosen)
             if (
                 iteration >= rounds - 1
@@ -681,19 +683,38 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
     return moved, float(np.abs(offsets).max())
 
 
-def _path_by_appearance(strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int]) -> Floats:
-    """Find the monotone path that best divides film from background between the columns that it passes. Distances from
-    either, in standard deviations of a pixel and a tenth of the contrast together, are clipped, so that a door, a
-    payload flying ahead or a reflection cannot capture it.
+def _path_by_appearance(
+    strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int]
+) -> tuple[Floats, NDArray[np.float32]]:
+    """Find the monotone path that best divides film from background between the columns that it passes, and what an
+    edge costs at each column of a frame, (n_frames, n_along). Distances from either, in standard deviations of a pixel
+    and a tenth of the contrast together, are clipped, so that a door, a payload flying ahead or a reflection cannot
+    capture it.
     """
     contrast = np.abs(appearance[0] - appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width)
     # 25, 2: columns behind the first passed one, and ahead of the last, up to which it may lie (chosen)
-    return np.clip(dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
+    path = np.clip(dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
+    return path, np.cumsum(evidence + kernels.FILM_BIAS * strip.values.shape[1], axis=1)
 
 
 BANDS_ERROR = 0.9  # Error of an edge over that which the scatter of its bands gives (measured on two renderers)
+
+
+def _hidden_px(contrast: NDArray[np.float32], edge: Floats, tube: Outline) -> Floats:
+    """Standard error of an edge behind a post: it may lie anywhere among neighbouring columns that look the same before
+    and behind it. Shapes: contrast (n_along,), of every column; edge (n_frames,) → (n_frames,).
+    """
+    # 0.15: part of the usual contrast above which a column tells on which side the edge is; 3: columns beside the edge
+    # that need not tell, for its blur (chosen)
+    first, behind = tube.passed
+    telling = contrast > 0.15 * np.median(contrast[first:behind])
+    telling[:first] = telling[behind:] = True
+    places, near = np.flatnonzero(telling), 3
+    before = places[np.maximum(np.searchsorted(places, edge - near, side="right") - 1, 0)]
+    after = places[np.minimum(np.searchsorted(places, edge + near), len(places) - 1)]
+    return np.maximum(after - before - 2 * near - 2, 0) / math.sqrt(12)
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
@@ -712,12 +733,13 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     unseen = np.sqrt(np.maximum(scatter**2 - sigma**2, 0.0))
     # 1.0, 21, 1.0: error of the pictures of film and background that all rows share, in grey levels of 255 (measured);
     # columns over which the contrast is taken, px, and its least, grey levels (chosen)
-    contrast = np.abs(median_filter((state.appearance[0] - state.appearance[1]).mean(axis=0), 21, mode="nearest"))
+    difference = state.appearance[0] - state.appearance[1]
+    contrast = np.abs(median_filter(difference.mean(axis=0), 21, mode="nearest"))
     column = np.clip(np.rint(edge_now), tube.passed[0], tube.passed[1] - 1).astype(int)
     shared = 1.0 / np.maximum(contrast[column], 1.0)
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
     guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
-    slow = np.sqrt(unseen**2 + shared**2 + guess**2)
+    slow = np.sqrt(unseen**2 + shared**2 + guess**2 + _hidden_px(np.abs(difference).mean(axis=0), edge_now, tube) ** 2)
     # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
     # above which any is, since something adds to the edge (chosen)
     odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)

@@ -81,6 +81,7 @@ def subpixel_index(place: float) -> tuple[int, int, float]:
 
 BANDS = 6  # Bands of rows from whose scatter the error of an edge is taken; 4 to 20 do as well (measured)
 FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
+FILM_BIAS = 0.1  # Evidence in favour of film in every pixel (chosen)
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -93,8 +94,7 @@ def film_evidence(
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
-    # 0.1: evidence in favour of film in every pixel (chosen)
-    unit, film_bias, extra_variance = np.float32(1.0), np.float32(0.1), np.float32(width * width)
+    unit, film_bias, extra_variance = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
     # 2.5: c, standard deviations at which the difference from film or background is clipped (chosen)
     background_clip, film_clip = np.float32(2.5**2), np.float32(FILM_CLIP_RATIO * 2.5**2)
     weight = unit / (appearance[2:] + extra_variance)
