@@ -327,7 +327,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cos
     anchor = int(moving[np.argmin(decentrality + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
     # Near the start a door passes for background, and only the motion tells.
-    edge, clear = out[:, 0].tolist(), fit[:, 0] >= clear_of_start(state.edge) + 0.5 * START_CLEARANCE_PX
+    edge, clear = out[:, 0].tolist(), fit[:, 0] >= clear_of_start(state.edge)
     for sense in (-1, 1):
         for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
             previous, second, third = (edge[min(max(t - k * sense, 0), len(edge) - 1)] for k in (1, 2, 3))
@@ -335,8 +335,9 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cos
             step = max(0.0 if math.isnan(gap) else abs(gap) for gap in (second - previous, third - second))
             reach = max(1.3 * step, step + 1.5)
             low, high = (previous - reach, previous + 0.8) if sense < 0 else (previous - 0.8, previous + reach)
-            inside, faint = low <= edge[t] <= high, out[t, 3] < LEAST_FITTED_AMPLITUDE - 1
-            if not math.isfinite(previous) or (inside and out[t, 2] <= bad_misfit and not faint):
+            inside, like_an_edge = low <= edge[t] <= high, abs(out[t, 3]) < 1 - LEAST_FITTED_AMPLITUDE
+            fits = out[t, 2] <= bad_misfit and like_an_edge
+            if not math.isfinite(previous) or (inside and fits):
                 continue
             places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))
             found = search_edges(strip, state, np.full(len(places), t), places)
@@ -351,7 +352,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cos
                 replace_it = len(found) > 0 and replacement[2] < out[t, 2]
             else:
                 own, there = np.clip(np.nan_to_num([edge[t], replacement[0]]), 0, cost.shape[1] - 1).astype(int)
-                replace_it = faint or not clear[t] or cost[t, there] < cost[t, own]
+                replace_it = not (fits and clear[t]) or cost[t, there] < cost[t, own]
             if replace_it:
                 out[t] = replacement
                 edge[t] = float(out[t, 0])
