@@ -24,8 +24,7 @@ from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, track_correlation
-from vinetrack.tracks.position_noise import rounding_noise
+from vinetrack.inference.optimiser import is_poor_fit
 
 # ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
@@ -158,10 +157,7 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
 def implausible(effects: Sequence[Effect], after: Fit, widened: float = 1.0, errors: float = 1.0) -> Remark:
     """Why the fitted sizes are not plausible; blank where they are, or might be within so much of their errors."""
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
-    averages = {f"{one.name}.{one.parameters[0].name}" for one in effects if "averaged_over" in one.functions}
     for number in after.numbers:
-        if number.key in averages and (frames := _frames_beyond_noise(number.value, after)):
-            return remark("noise_is_not_averaged", frames=frames)
         if (parameter := parameters.get(number.key)) is None or not math.isfinite(number.sigma):
             continue
         low, high = parameter.plausible or (math.nan, math.nan)
@@ -174,19 +170,6 @@ def implausible(effects: Sequence[Effect], after: Fit, widened: float = 1.0, err
             facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
             return Remark("implausible_size", facts | {"pressure_unit": number.pressure_unit})
     return Remark()
-
-
-def _frames_beyond_noise(average_s2: float, after: Fit) -> float:
-    """How many frames an average takes in if their noise shows that it was not taken: noise averaged over N frames has
-    a lag-one correlation of 1 − 1/N. 0 where the noise may be averaged, or is that of rounding.
-    """
-    data = [one for one in after.predictor.data if one.smoothing is None]
-    own = [one for one in data if rounding_noise(one.lead_position_m) < 0.5 * one.noise_m]
-    if not own:
-        return 0.0
-    frames = math.sqrt(1 + max(average_s2, 0.0) / float(np.median([one.frame_s for one in own])) ** 2)
-    # 3, 0.3: least number of frames, and part of the correlation that noise must show (chosen)
-    return frames if frames >= 3 and track_correlation(own) < 0.3 * (1 - 1 / frames) else 0.0
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:

@@ -43,9 +43,10 @@ from vinetrack.inference.marginal_likelihood import (
     summed,
     trial_effect_prior,
 )
-from vinetrack.inference.optimiser import relative_residuals
+from vinetrack.inference.optimiser import relative_residuals, track_correlation
 from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.systematics import systematics_of
+from vinetrack.tracks.position_noise import rounding_noise
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
@@ -99,6 +100,8 @@ def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
         return remark("no_tube", column=of_tube[0])
     if effect.in_trace and all(has_trace):
         return remark("in_measured_pressure")
+    if "averaged_over" in effect.functions and not _may_be_averages(data):
+        return remark("noise_is_not_averaged")
     if "trace_time" in effect.functions and not any(has_trace):
         return remark("no_measured_pressure")
     if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
@@ -108,6 +111,12 @@ def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
     except EffectError:
         return remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
     return Remark()
+
+
+def _may_be_averages(data: Sequence[FitTrial]) -> bool:
+    """Whether the noise of positions as they were measured may be that of averages, which neighbours share."""
+    own = [one for one in data if one.smoothing is None and rounding_noise(one.lead_position_m) < 0.5 * one.noise_m]
+    return not own or track_correlation(own) > 0.2  # that of averages over two frames is 0.5 (chosen)
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
