@@ -35,7 +35,7 @@ BUDGETS = {
     "inference": (5185, 14, 49),
     "interface": (567, 2, 2),
     "kinematics": (1618, 6, 12),
-    "laboratory": (1600, 6, 9),
+    "laboratory": (1567, 6, 9),
     "narrative": (1048, 3, 8),
     "pages": (2815, 7, 22),
     "paper": (891, 4, 35),

@@ -13,10 +13,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import av
+import cv2
 import numpy as np
 import pandas as pd
 import yaml
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import replacing, write_bytes, write_csv, write_text
@@ -35,8 +38,6 @@ def render_recording(
     scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, out_path: Path, seed: int = 0
 ) -> Truth:
     """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all."""
-    import av
-
     renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
     camera, encoding, depth = scene.camera, scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
@@ -45,7 +46,11 @@ def render_recording(
     if pixel_format is None:
         raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
-    chroma = _chroma(scene)
+    # The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene
+    rows, columns = (camera.height_px + 1) // 2, (camera.width_px + 1) // 2
+    fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
+    warm = (12, -8) if scene.sensor.colour else (0, 0)  # a warm wall and bluish film under LED lamps
+    chroma = [(128 - change * fade).astype(np.uint8) for change in warm]
     options = {"movflags": "+faststart"} if out_path.suffix.lower() in (".mp4", ".mov") else {}
     with replacing(out_path) as draft, av.open(str(draft), "w", options=options) as container:
         # 60: frames per second that a file of a high-speed camera claims (chosen)
@@ -70,14 +75,6 @@ def render_recording(
     return renderer.truth(np.arange(n_frames))
 
 
-def _chroma(scene: Scene) -> tuple[Frame, Frame]:
-    """The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene."""
-    rows, columns = (scene.camera.height_px + 1) // 2, (scene.camera.width_px + 1) // 2
-    fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
-    u, v = (12, -8) if scene.sensor.colour else (0, 0)  # a warm wall and bluish film under LED lamps
-    return (128 - u * fade).astype(np.uint8), (128 - v * fade).astype(np.uint8)
-
-
 # ------------------------------------------------------------------------------
 # Pictures of a calibration target.
 
@@ -87,8 +84,6 @@ def render_target(target: Target, scene: Scene, *, seed: int = 0) -> Frame:
     `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by
     a quarter across the picture. Shape (height, width).
     """
-    import cv2
-
     bare, camera = replace(scene.backdrop, launcher=False, ruler=False, clutter=False), scene.camera
     scene = replace(scene, backdrop=bare, door=None)
     empty = FrameRenderer(scene, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
@@ -126,8 +121,6 @@ def make_filming(content: dict[str, Any]) -> Filming:
 
 def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
     """Film one simulated trial, with a tube of the stated size; its truth is returned and not written."""
-    from scipy.interpolate import PchipInterpolator
-
     stated, scene = trial.stated, preset(filming.scene)
     subject, capture_fps = scene.subject, stated.capture_fps
     if isinstance(subject, Tube):
@@ -151,8 +144,6 @@ def compile_the_tracker() -> None:
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
     """Write a picture of the calibration target in the plane of growth as PNG."""
-    import cv2
-
     picture = render_target(filming.target, replace(preset(filming.scene), camera=filming.camera), seed=seed)
     write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 

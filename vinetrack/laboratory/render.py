@@ -14,8 +14,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
@@ -45,8 +47,6 @@ def _paste(
     canvas: Image, patch: Image, scene: Scene, corner: tuple[int, int], along_px: float, across_px: float
 ) -> Image:
     """Lay a patch drawn along the path over `canvas`, its top left at (along_px, across_px)."""
-    import cv2
-
     ux, uy = scene.direction
     x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
     y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
@@ -57,8 +57,6 @@ def _paste(
 
 def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
     """Paint a steel ruler, shape (width_px, length_px): tick k mm is centred k·px_per_mm from the first column."""
-    import cv2
-
     k = 4  # sub-pixels per pixel
     big = np.full((width_px * k, length_px * k), 0.62, dtype=np.float32)
     ink = np.zeros(big.shape, dtype=np.uint8)
@@ -82,8 +80,6 @@ def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random
 
 def _launcher_patch(radius_px: float, rng: np.random.Generator) -> Image:
     """Paint the block from which the tube grows: dark anodised aluminium with a knurled clamp ring and screws."""
-    import cv2
-
     height, width = int(2.9 * radius_px), 400
     across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     patch = 0.10 + 0.10 * np.exp(-(((across + 0.6) / 0.16) ** 2)) + np.zeros((1, width), dtype=np.float32)
@@ -104,8 +100,6 @@ def _launcher_patch(radius_px: float, rng: np.random.Generator) -> Image:
 
 def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
     """Add out-of-focus objects on the wall: an aluminium profile with its slot, a hose, a label."""
-    import cv2
-
     height, width = canvas.shape
     level = scene.backdrop.brightness
     things = canvas.copy()
@@ -129,8 +123,6 @@ def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
 
 def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
     """Paint the static scene, blurred by the optics."""
-    import cv2
-
     yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
     along = (dx * scene.direction[0] + dy * scene.direction[1]).astype(np.float32)
@@ -159,8 +151,6 @@ def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
     """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, creases in all directions. A
     crease is a bright flank beside a dark one; most are short and within 60° of the tube's axis.
     """
-    import cv2
-
     rows, columns = shape
     lines = np.zeros((2 * rows, 2 * columns), dtype=np.float32)
     for _ in range(max(columns // 3, 8)):
@@ -648,8 +638,6 @@ def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, N
     """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core, each of
     shape (n_entries,).
     """
-    from scipy.special import ndtr
-
     half = math.ceil((radius_px + 5) * PROFILE_PER_PX)
     v = np.abs(np.arange(-half, half + 1)) / PROFILE_PER_PX
     corner = max(tube.tip_roundness * radius_px, 1e-6)
@@ -693,8 +681,6 @@ def lay_door(light: Image, scene_motion: SceneMotion, door: Door, frame: int, sh
     """Lay the door over a picture, shape (height, width), in place: a plate hinged beside the resting tip that swings
     out of the path, averaged over the beginning, middle and end of the exposure.
     """
-    import cv2
-
     scene = scene_motion.scene
     scale, (ux, uy) = scene.camera.m_per_px, scene.direction
     axes = np.array([[ux, uy], [-uy, ux]])
@@ -753,8 +739,6 @@ class FrameRenderer:
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float | None = None,
         seed: int = 0,
     ) -> None:  # fmt: skip
-        from scipy.special import ndtri
-
         self.scene, self._seed = scene, seed
         self.exposure_s = scene.exposure_fraction / capture_fps if exposure_s is None else exposure_s
         if not 0 < self.exposure_s <= 1 / capture_fps:
@@ -766,7 +750,10 @@ class FrameRenderer:
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )
         # The backdrop, painted on plane pixels, and projected through the lens once, for frames without shake
-        plane_x, plane_y = scene.camera.plane_maps()
+        camera = scene.camera
+        is_plain = camera.k1 == camera.k2 == camera.tilt_x_deg == camera.tilt_y_deg == 0
+        plane = camera.pixels() if is_plain else camera.plane_from_picture(camera.pixels())
+        plane_x, plane_y = plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)
         margin = 4 + math.ceil(4 * scene.shake_px)
         x0, y0 = (math.floor(part.min()) - margin for part in (plane_x, plane_y))
         x1, y1 = (math.ceil(part.max()) + margin for part in (plane_x, plane_y))
@@ -786,7 +773,7 @@ class FrameRenderer:
             centre = lambda time_s: self._motion.lead_px(time_s) - radius  # noqa: E731
             self._subject = BallLayer(self._motion, maps, rng, scene.subject, centre)
         # The sensor: gain of every pixel (vignetting, fixed pattern), and normal deviates
-        camera, rng = scene.camera, np.random.default_rng([seed, 3])
+        rng = np.random.default_rng([seed, 3])
         radius2 = ((camera.pixels() - camera.centre_px) ** 2).sum(axis=-1) / np.square(camera.centre_px).sum()
         spread = rng.standard_normal(radius2.shape) + 0.5 * rng.standard_normal((1, camera.width_px))
         falloff = 1 - scene.light.vignetting * radius2
@@ -794,8 +781,8 @@ class FrameRenderer:
         quantiles = ndtri((np.arange(1 << NORMAL_BITS) + 0.5) / (1 << NORMAL_BITS))
         self._normals = (quantiles / quantiles.std()).astype(np.float32)
 
-    def radiance(self, frame: int) -> Image:
-        """Return the radiance at the sensor, before lamps, gain and noise. Shape (height, width)."""
+    def frame(self, frame: int, **levels: float) -> NDArray[np.uint8 | np.uint16]:
+        """Render the grey levels of one frame. Shape (height, width)."""
         shake = self._motion.shake_px(float(self._motion.mid_exposure_s(frame)))
         light = self.still.copy()
         if shake != (0.0, 0.0):
@@ -804,11 +791,7 @@ class FrameRenderer:
             lay_door(light, self._motion, self.scene.door, frame, shake)
         ux, uy = self.scene.direction
         self._subject.lay(light, frame, (shake[0] * ux + shake[1] * uy, shake[1] * ux - shake[0] * uy))
-        return light
-
-    def frame(self, frame: int, **levels: float) -> NDArray[np.uint8 | np.uint16]:
-        """Render the grey levels of one frame. Shape (height, width)."""
-        return self.expose(self.radiance(frame), frame, **levels)
+        return self.expose(light, frame, **levels)
 
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,12 +77,6 @@ class Camera:
         """Return the coordinates of all pixels, shape (height_px, width_px, 2)."""
         return np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
 
-    def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Plane pixel of each picture pixel: x and y, each of shape (height_px, width_px)."""
-        is_plain = self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
-        plane = self.pixels() if is_plain else self.plane_from_picture(self.pixels())
-        return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)
-
 
 PATTERN_PX = 120  # Side of a square in the stored pattern of a ChArUco board (chosen)
 
@@ -114,8 +109,6 @@ class Target:
 
     def pattern(self) -> NDArray[np.uint8]:
         """Printed pattern, 1 where white: PATTERN_PX per square for a ChArUco board, 1 for a checkerboard."""
-        import cv2
-
         if self.kind != "charuco":
             rows, columns = np.mgrid[: self.squares[1], : self.squares[0]]
             return ((rows + columns) % 2).astype(np.uint8)
