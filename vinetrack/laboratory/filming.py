@@ -47,8 +47,8 @@ def render_recording(
         raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
     # The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene
-    rows, columns = (camera.height_px + 1) // 2, (camera.width_px + 1) // 2
-    fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
+    height, width = (camera.height_px + 1) // 2, (camera.width_px + 1) // 2
+    fade = np.linspace(0, 1, width)[None, :] + 0.2 * np.linspace(0, 1, height)[:, None]
     warm = (12, -8) if scene.sensor.colour else (0, 0)  # a warm wall and bluish film under LED lamps
     chroma = [(128 - change * fade).astype(np.uint8) for change in warm]
     options = {"movflags": "+faststart"} if out_path.suffix.lower() in (".mp4", ".mov") else {}
