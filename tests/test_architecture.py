@@ -41,7 +41,7 @@ BUDGETS = {
     "paper": (891, 4, 35),
     "pipeline": (1982, 7, 6),
     "planning": (1583, 4, 24),
-    "report": (786, 3, 4),
+    "report": (750, 3, 4),
     "results": (475, 4, 9),
     "tracks": (1482, 4, 19),
     "video": (4921, 12, 71),

@@ -266,7 +266,7 @@ def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(
     folders = tmp_path / "results" / "vines" / "tracks", tmp_path / "vines"
     for folder in folders:
         folder.mkdir(parents=True)
-        for name in (f".tmp-{'0f' * 16}.csv", ".part-a.mp4", ".tmp-mine", f".tmp-{'1e' * 16}.csv"):
+        for name in (f".tmp-{'0f' * 16}.csv", f".tmp-{'2a' * 16}.mp4", ".tmp-mine", f".tmp-{'1e' * 16}.csv"):
             (folder / name).touch()
             if "1e" not in name:
                 os.utime(folder / name, (1e9, 1e9))

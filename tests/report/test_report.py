@@ -135,17 +135,13 @@ def png() -> bytes:
     return file.getvalue()
 
 
-def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short_coordinates():
-    data = base64.b64encode(png()).decode()
-    placed = f'<image xlink:href="data:image/png;base64,{data}" transform="matrix(0.123456 0 0 1 0 0)"/></svg>'
-    given = SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed)
-    svg = build.inline_picture(given, "law", 'a "law"')
+def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions():
+    svg = build.inline_picture(SVG, "law", 'a "law"')
     assert svg.startswith("<svg")
     for kept in ("currentColor", "var(--blue)", 'viewBox="0 0 504 360"', 'id="law-0"', "url(#law-0)"):
         assert kept in svg
-    for made in ('aria-label="a &quot;law&quot;"', "M 0.12 0 5 5", "matrix(0.123456 0", "data:image/webp"):
-        assert made in svg
-    for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"', data):
+    assert 'aria-label="a &quot;law&quot;"' in svg
+    for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"'):
         assert gone not in svg
 
 
@@ -153,7 +149,7 @@ def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn():
     html = page(figures=[build.ReportFigure("law", "Law", "caption", png())])
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
     assert [image["style"] for image in images] == ["--wide:192px"]  # 2 in of 96 px
-    assert all(str(image["src"]).startswith("data:image/webp;base64,") for image in images)
+    assert all(str(image["src"]).startswith("data:image/png;base64,") for image in images)
 
 
 # The section on the diagnosis, for every verdict, for a refused diagnosis, and without one.
@@ -334,8 +330,7 @@ def test_page_and_pictures_follow_a_dark_screen(chrome, address):
     ask = {
         "page": "getComputedStyle(document.body).backgroundColor",
         "text": "getComputedStyle(document.querySelector('#figure-ladder text')).fill",
-        "grid": "getComputedStyle(document.querySelector('#figure-ladder ' + [...document.styleSheets[0].cssRules]"
-        ".find((rule) => rule.style?.stroke?.includes('--grid')).selectorText)).stroke",
+        "grid": "getComputedStyle(document.querySelector('#figure-ladder [style*=\"--grid\"]')).stroke",
     }
     brightness = {}
     for scheme in ("light", "dark"):

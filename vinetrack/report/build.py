@@ -61,58 +61,31 @@ def inline_picture(picture: str | bytes | None, prefix: str, description: str) -
     """Return an SVG or PNG file as an element of the page, `--wide` if there is room; blank for none."""
     if not picture:
         return Markup()
+    label = escape(description, quote=True)
     if isinstance(picture, str):
-        return Markup(_inline_svg(picture, prefix, description))
+        return Markup(_inline_svg(picture, prefix, label))
     from PIL import Image
 
     image = Image.open(io.BytesIO(picture))
     wide = 96 * image.width / image.info.get("dpi", (150, 150))[0]
-    source = _as_webp(picture, 85)  # The same of a whole figure, whose letters must stay sharp (chosen)
-    return Markup(f'<img alt="{escape(description, quote=True)}" style="--wide:{wide:.0f}px" src="{source}">')
+    return Markup(f'<img alt="{label}" style="--wide:{wide:.0f}px" src="{base64_uri("image/png", picture)}">')
 
 
-def _inline_svg(svg: str, prefix: str, description: str) -> str:
-    """An SVG of matplotlib with its colours and fonts from the page, so that it follows a dark scheme, the identifiers
-    that it uses unique, coordinates to a tenth of a point, and its images as WebP.
-    """
+def _inline_svg(svg: str, prefix: str, label: str) -> str:
+    """An SVG of matplotlib with its colours from the page, so that it follows a dark scheme, and unique identifiers."""
     found = re.search(r'<svg[^>]* viewBox="0 0 ([\d.]+) ([\d.]+)"[^>]*>(.*)</svg>', svg, re.DOTALL)
     if found is None:
         raise ValueError("not an SVG file of a figure")
     width, height = float(found[1]), float(found[2])
     colours = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
-    any_colour = re.compile("|".join(colours))
-
-    def short(tag: re.Match[str]) -> str:
-        text = re.sub(r"\.0+(?= )", "", re.sub(r"(\d\d\.\d|\.\d\d)\d+", r"\1", tag[0]))
-        text = text if " C " in text else text.replace(" L ", " ")  # places after a move are lines to them
-        return any_colour.sub(lambda match: colours[match[0]], text)
-
     body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", found[3], flags=re.DOTALL)
-    body = re.sub(r"<(?!image)[^>]*>", short, body)  # images are placed by matrices, which need all their decimals
+    body = re.sub("|".join(colours), lambda match: colours[match[0]], body)
     used = dict.fromkeys(re.findall(r'(?:url\(|href=")#([^")]+)', body))
     own = {name: f"{escape(prefix, quote=True)}-{k}" for k, name in enumerate(used)}
     body = re.sub(r' id="([^"]*)"', lambda match: f' id="{own[match[1]]}"' if match[1] in own else "", body)
     body = re.sub(r'(url\(|href=")#([^")]+)', lambda match: f"{match[1]}#{own[match[2]]}", body)
-    body = re.sub(r'font-family: [^;"]*;? ?| transform="rotate\(-0 [^"]*"', "", body)
-    # WebP quality of the images in a strip, 0 to 100
-    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 30), body)
-    body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body)).replace("xlink:href", "href")
-    label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
     return f"<svg {head}>{body}</svg>"
-
-
-def _as_webp(png: bytes, quality: int) -> str:
-    """Return a PNG as a data URI of a WebP."""
-    from PIL import Image
-
-    picture = Image.open(io.BytesIO(png))
-    is_opaque = picture.mode != "RGBA" or picture.getchannel("A").getextrema() == (255, 255)
-    file = io.BytesIO()
-    picture.convert("RGB" if is_opaque else "RGBA").save(
-        file, "WEBP", quality=quality, method=2
-    )  # a tenth larger than 4 in half the time
-    return base64_uri("image/webp", file.getvalue())
 
 
 def base64_uri(kind: str, content: bytes) -> str:
@@ -344,33 +317,32 @@ def calibration_table(calibrations: Mapping[str, Mapping[str, Any]]) -> list[dic
         own = one["mm_per_px"] if one["kind"] == "sheet" else None
         key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"], own)
         groups.setdefault(key, []).append((name, one))
-    return list(map(_calibration_row, groups.values()))
-
-
-def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     names = {
         "charuco": "ChArUco board",
         "two_points": "two points and their distance",
         "mm_per_px": "millimetres per pixel, as given",
         "sheet": "millimetres per pixel, from the sheet",
     }
-    first = members[0][1]
-    scales = [one["mm_per_px"] for _, one in members]
-    spread = number(min(scales), 6)
-    if max(scales) - min(scales) > 1e-5 * max(scales):
-        spread += f" to {number(max(scales), 6)}"
-    errors = [one["scale_rel_sigma"] for _, one in members if is_finite(one["scale_rel_sigma"])]
-    has_target = bool(first["n_corners"]) and is_finite(first["reprojection_px"])
-    return {
-        "kind": names.get(first["kind"], first["kind"]),
-        "image": first["image"] or "",
-        "mm_per_px": spread,
-        "error": f"{number(100 * max(errors), 2)} %" if errors else "unknown",
-        "reprojection": f"{number(first['reprojection_px'], 2)} px" if has_target else "–",
-        "corners": f"{first['n_corners']} in {first['n_pictures']}" if has_target else "–",
-        "notes": first["notes"],
-        "trials": f"{len(members)} recordings" if len(members) > 1 else members[0][0],
-    }
+    table = []
+    for members in groups.values():
+        first = members[0][1]
+        scales = [one["mm_per_px"] for _, one in members]
+        spread = number(min(scales), 6)
+        if max(scales) - min(scales) > 1e-5 * max(scales):
+            spread += f" to {number(max(scales), 6)}"
+        errors = [one["scale_rel_sigma"] for _, one in members if is_finite(one["scale_rel_sigma"])]
+        has_target = bool(first["n_corners"]) and is_finite(first["reprojection_px"])
+        table.append({
+            "kind": names.get(first["kind"], first["kind"]),
+            "image": first["image"] or "",
+            "mm_per_px": spread,
+            "error": f"{number(100 * max(errors), 2)} %" if errors else "unknown",
+            "reprojection": f"{number(first['reprojection_px'], 2)} px" if has_target else "–",
+            "corners": f"{first['n_corners']} in {first['n_pictures']}" if has_target else "–",
+            "notes": first["notes"],
+            "trials": f"{len(members)} recordings" if len(members) > 1 else members[0][0],
+        })  # fmt: skip
+    return table
 
 
 # ------------------------------------------------------------------------------
@@ -504,13 +476,13 @@ def build_report(content: dict[str, Any]) -> str:
     """Return the page with this content (`report_content`). User text is escaped; only SVG of the package is not."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    form: dict[str, Any] = {
-        "autoescape": True,
-        "undefined": StrictUndefined,
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-    }
-    environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
+    environment = Environment(
+        loader=PackageLoader("vinetrack.report"),
+        undefined=StrictUndefined,
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
     in_templates = (rows, bounds_text, estimates_text, listed_names, spaced_name, expected_text, model_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, base64_uri)}
@@ -536,8 +508,4 @@ def build_report(content: dict[str, Any]) -> str:
             "run": content["provenance"]["settings"],
         }
     )
-    # Each style of the figures stands once in the page, as a class.
-    styles: dict[str, str] = {}
-    page = re.sub(r' style="([^"-][^"]*)"', lambda m: f' class="{styles.setdefault(m[1], f"f{len(styles)}")}"', page)
-    page = re.sub("`([^`<]+)`", r"<code>\1</code>", page)
-    return page.replace("</style>", "".join(f".{k} {{{style}}}" for style, k in styles.items()) + "</style>", 1)
+    return re.sub("`([^`<]+)`", r"<code>\1</code>", page)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, Trial, with_flag
-from vinetrack.core.tables import write_bytes, write_csv
+from vinetrack.core.tables import replacing, write_bytes, write_csv
 from vinetrack.experiment.settings import OverlaySettings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.style import GREEN, render
@@ -212,32 +211,28 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
     import av
     import cv2
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".part-{path.name}")
     count, stream = 0, None
-    try:
-        with av.open(str(draft), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-            for count, picture in enumerate(pictures, 1):
-                if stream is None:
-                    height, width = picture.shape[:2]
-                    if height % 2 or width % 2:
-                        raise ValueError(f"a clip needs pictures of even sides, not {width} × {height}")
-                    stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
-                    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                    # Without mbtree=0 the same pictures are encoded to different bytes (measured).
-                    options = {"preset": "superfast", "crf": "26", "profile": "high", "tune": "animation"}
-                    stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
-                    context.thread_count = 1
-                    context.colorspace = context.color_primaries = context.color_trc = 6  # BT.601, as OpenCV converts
-                planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
-                frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-                frame.pts = count - 1
-                container.mux(stream.encode(frame))
+    with (
+        replacing(path) as draft,
+        av.open(str(draft), "w", format="mp4", options={"movflags": "+faststart"}) as container,
+    ):
+        for count, picture in enumerate(pictures, 1):
             if stream is None:
-                raise ValueError("there is no picture to make a clip of")
-            container.mux(stream.encode())
-        draft.replace(path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            draft.unlink()
+                height, width = picture.shape[:2]
+                if height % 2 or width % 2:
+                    raise ValueError(f"a clip needs pictures of even sides, not {width} × {height}")
+                stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                # Without mbtree=0 the same pictures are encoded to different bytes (measured).
+                options = {"preset": "superfast", "crf": "26", "profile": "high", "tune": "animation"}
+                stream.options, context = {**options, "mbtree": "0"}, stream.codec_context
+                context.thread_count = 1
+                context.colorspace = context.color_primaries = context.color_trc = 6  # BT.601, as OpenCV converts
+            planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420), dtype=np.uint8)
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+            frame.pts = count - 1
+            container.mux(stream.encode(frame))
+        if stream is None:
+            raise ValueError("there is no picture to make a clip of")
+        container.mux(stream.encode())
     return count

@@ -67,7 +67,7 @@ def begin_run(results: Path, experiment: Path) -> FileLock:
     lock = locked(results)
     claim = {"experiment": experiment.absolute().as_posix(), "process": os.getpid()}
     write_text(results / CLAIM_FILE, json.dumps(claim))
-    unfinished = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")  # names of files that are being written
+    unfinished = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?")  # names of files that are being written
     for path in [*results.rglob("*"), *experiment.glob("*")]:
         with contextlib.suppress(OSError):
             # 60.0: age from which an unfinished file counts as abandoned; others may be written now (chosen)
