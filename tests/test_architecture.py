@@ -42,7 +42,7 @@ BUDGETS = {
     "pipeline": (1982, 7, 6),
     "planning": (1583, 4, 24),
     "report": (750, 3, 4),
-    "results": (475, 4, 9),
+    "results": (346, 3, 8),
     "tracks": (1482, 4, 19),
     "video": (4921, 12, 71),
 }

@@ -14,17 +14,17 @@ from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, refused
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.figures import registry as drawn
 from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, FigureTables, draw, figures_of, label_conditions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import published
-from vinetrack.pipeline.model_stage import propose_effect, sheet_contradictions, with_contradictions
+from vinetrack.pipeline.model_stage import all_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
-from vinetrack.results import diagnosis_tables as drawn
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_source_experiment
 
 
@@ -136,14 +136,14 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     former = ladder("", "leak").assign(model=["+".join(BASE), "+".join([*BASE, "leak"])])
     former.to_csv(results.ladder, index=False)
     now = former[1:].assign(added="").reset_index(drop=True)
-    assert drawn.all_steps(results, now)["added"].tolist() == ["", "leak"]
+    assert all_steps(results, now)["added"].tolist() == ["", "leak"]
     results.kept_steps.parent.mkdir()
-    drawn.all_steps(results, now).to_csv(results.kept_steps, index=False)
+    all_steps(results, now).to_csv(results.kept_steps, index=False)
     results.ladder.unlink()  # as a run does before it writes it again
-    assert drawn.all_steps(results, now)["added"].tolist() == ["", "leak"]
-    assert drawn.all_steps(results, now.assign(rms_in_sample_m=1.0))["added"].tolist() == [""], "of other trials"
+    assert all_steps(results, now)["added"].tolist() == ["", "leak"]
+    assert all_steps(results, now.assign(rms_in_sample_m=1.0))["added"].tolist() == [""], "of other trials"
     read = replace(read_diagnosis(results), ladder=now)
-    assert len(drawn.DiagnosisTables(read, tables={"steps.csv": drawn.all_steps(results, now)}).ladder) == 2
+    assert len(drawn.DiagnosisTables(read, tables={"steps.csv": all_steps(results, now)}).ladder) == 2
 
 
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):

@@ -15,10 +15,9 @@ import numpy as np
 from vinetrack.core.units import display_unit, number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.figures import style as st
-from vinetrack.figures.registry import figure
+from vinetrack.figures.registry import figure, rms_m
 from vinetrack.narrative.diagnosis_text import drift_condition
 from vinetrack.narrative.verdict_text import expected_text
-from vinetrack.results.diagnosis_tables import rms_m
 
 if TYPE_CHECKING:
     import pandas as pd

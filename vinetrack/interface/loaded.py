@@ -46,7 +46,7 @@ from vinetrack.tracks.importers import flag_end_of_motion, table_track
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vinetrack.results.diagnosis_tables import DiagnosisTables
+    from vinetrack.figures.registry import DiagnosisTables
 
 
 class LoadedResults(Printed, Drawn):
@@ -361,8 +361,8 @@ def _described(trials: Sequence[Trial]) -> pd.DataFrame:
 
 def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     """The tables of a diagnosis as a results folder would hold them."""
+    from vinetrack.figures.registry import CURVE_COLUMNS, DiagnosisTables
     from vinetrack.pipeline.model_stage import diagnosis_tables, predictions
-    from vinetrack.results.diagnosis_tables import CURVE_COLUMNS, DiagnosisTables
 
     curves = []
     for one, table in predictions(shown.fits[0], shown.fits[-1]) if shown.fits else ():

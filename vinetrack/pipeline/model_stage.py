@@ -45,8 +45,15 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.diagnosis_tables import all_steps
-from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis, read_json, table_of
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    measured_trials,
+    read_diagnosis,
+    read_json,
+    read_result,
+    table_of,
+)
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
@@ -200,6 +207,20 @@ def write_diagnosis(
     write_csv(results.ladder, ladder)
     summary = [vars(row) for row in verdict_table(diagnosis)]
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
+
+
+def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+    """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
+    if its error there is the same, so that it is of the same trials.
+    """
+    import pandas as pd
+
+    former = next((read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0])
+    known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
+    for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
+        if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
+            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
+    return ladder
 
 
 def _laws(diagnosis: Diagnosis, motions: list[TrialMotion], settings: RunSettings) -> pd.DataFrame:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.results.diagnosis_tables import DiagnosisTables
+    from vinetrack.figures.registry import DiagnosisTables
 
 
 # ------------------------------------------------------------------------------
