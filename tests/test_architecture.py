@@ -28,7 +28,7 @@ BUDGETS = {
     "cli": (693, 4, 5),
     "core": (950, 7, 25),
     "diagnosis": (5830, 14, 87),
-    "dynamics": (2277, 8, 26),
+    "dynamics": (2265, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (1996, 8, 29),

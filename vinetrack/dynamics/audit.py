@@ -59,15 +59,29 @@ def evaluate(
     check_needs(model, trial)
     hooks = _Hooks(model, trial, measured=measured_Pa is not None)
     rig = hooks.rig
-    state = _initial_state(
-        trial, rig, *(np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s))
-    )
-    ones, nothing = np.ones_like(state.time), np.zeros_like(state.time)
+    time, position, velocity = (np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s))
+    ones, nothing = np.ones_like(time), np.zeros_like(time)
+    angles = (np.clip(position - bend.start_m, 0.0, bend.arc_m) / bend.radius_m for bend in trial.bends)
+    fields: dict[str, Any] = {
+        **{name: getattr(rig, name) * ones for name in ("set_pressure", "yield_pressure", "area", "linear_density")},
+        **{"time": time, "lead_position": position, "lead_velocity": velocity, "observed": position},
+        **{"tail_position": rig.travel_ratio * position, "tail_velocity": rig.travel_ratio * velocity},
+        **{"pressure": rig.set_pressure * ones, "moving_mass": ones, "damping_gain": ones},
+        **{"bend_angle": sum(angles, nothing), "tail_tension": nothing},
+    }
+    state = State(**fields)
     film = np.prod([ones, *hooks.each("film_gain", state).values()], axis=0)
     film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
     moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
-    state = hooks.changed("damping_gain", _with_pressure(hooks, state, measured_Pa))
+    state = hooks.changed("gauge", state)
+    state = hooks.changed("yield_gauge", state._replace(set_pressure=state.pressure))
+    if measured_Pa is not None:
+        measured: Any = np.asarray(measured_Pa, dtype=float)
+        state = hooks.changed("gauge", state._replace(pressure=measured))
+    elif hooks.calls.get("chamber_rate"):
+        state = state._replace(pressure=_chamber_pressure(hooks, state))
+    state = hooks.changed("damping_gain", _with_consistent_area(hooks, state))
     tip = hooks.each("tip_force", state)
     tension = sum(tip.values(), nothing) / rig.travel_ratio
     tail = sum(hooks.each("tail_force", state).values(), nothing)
@@ -115,31 +129,6 @@ class _Hooks:
             name: np.broadcast_to(np.asarray(function(state, self.rig, *values), dtype=float), np.shape(state.time))
             for name, function, values in self.calls.get(hook, ())
         }
-
-
-def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
-    ones, nothing = np.ones_like(time), np.zeros_like(time)
-    angles = (np.clip(position - bend.start_m, 0.0, bend.arc_m) / bend.radius_m for bend in trial.bends)
-    fields: dict[str, Any] = {
-        **{name: getattr(rig, name) * ones for name in ("set_pressure", "yield_pressure", "area", "linear_density")},
-        **{"time": time, "lead_position": position, "lead_velocity": velocity, "observed": position},
-        **{"tail_position": rig.travel_ratio * position, "tail_velocity": rig.travel_ratio * velocity},
-        **{"pressure": rig.set_pressure * ones, "moving_mass": ones, "damping_gain": ones},
-        **{"bend_angle": sum(angles, nothing), "tail_tension": nothing},
-    }
-    return State(**fields)
-
-
-def _with_pressure(hooks: _Hooks, state: State, measured_Pa: Floats | None) -> State:
-    """Gauge, chamber, area and losses, in the order of the physics."""
-    state = hooks.changed("gauge", state)
-    state = hooks.changed("yield_gauge", state._replace(set_pressure=state.pressure))
-    if measured_Pa is not None:
-        measured: Any = np.asarray(measured_Pa, dtype=float)
-        state = hooks.changed("gauge", state._replace(pressure=measured))
-    elif hooks.calls.get("chamber_rate"):
-        state = state._replace(pressure=_chamber_pressure(hooks, state))
-    return _with_consistent_area(hooks, state)
 
 
 def _with_consistent_area(hooks: _Hooks, state: State) -> State:
@@ -278,7 +267,13 @@ def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
         # A pressure measured during growth includes what happens in the chamber.
         neglected = [effect for effect in left if not (effect.in_trace and motion.pressure_Pa is not None)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
-        tension = _tension_row(own, own.terms(model).tension_N)
+        tension_N, drive_N = own.terms(model).tension_N, own.drive_N()
+        i = int(np.argmin(tension_N))
+        share = float(tension_N[i]) / float(drive_N[i]) if drive_N[i] > 0 else math.nan
+        negative = np.flatnonzero(tension_N < -1e-6 * drive_N)  # 1e-6: beyond the rounding of a simulation
+        slack_from_s = float(own.time_s[negative[0]]) if negative.size else math.nan
+        least: dict[str, Any] = {"force_N": float(tension_N[i]), "share_of_drive": share, "slack_from_s": slack_from_s}
+        tension = own.row("tail_tension", i, **least)
         rows += [*left_out, tension]
         violated = _violated_rules(model, motion, {row["term"]: row for row in left_out}, tension)
         violations += [RuleViolation(motion.trial.name, rule, words) for rule, words in violated]
@@ -309,15 +304,6 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
     return motion.row(effect.name, i, size=size, force_N=float(force[i]), share_of_drive=float(share[i]))
 
 
-def _tension_row(motion: AuditedMotion, tension: Floats) -> dict[str, Any]:
-    i = int(np.argmin(tension))
-    drive = float(motion.drive_N()[i])
-    share = float(tension[i]) / drive if drive > 0 else math.nan
-    negative = np.flatnonzero(tension < -1e-6 * motion.drive_N())  # 1e-6: beyond the rounding of a simulation
-    slack_from_s = float(motion.time_s[negative[0]]) if negative.size else math.nan
-    return motion.row("tail_tension", i, force_N=float(tension[i]), share_of_drive=share, slack_from_s=slack_from_s)
-
-
 def _violated_rules(
     model: Model, motion: AuditedMotion, neglected: Mapping[str, dict[str, Any]], tension: dict[str, Any]
 ) -> Iterator[tuple[str, str]]:
@@ -337,27 +323,22 @@ def _violated_rules(
     if "capstan_friction" in neglected and bent_deg >= 30:
         safe = "which is safe to neglect below 30°"
         yield "bends", f"the path bends by {bent_deg:.0f}° in all, {safe}; add capstan_friction to the model"
-    yield from _reservoir_rule(model, motion, neglected.get("reservoir_depletion"))
+    # The reservoir's rule, by the gas law in absolute pressure, for slow and for fast expansion
+    reservoir, pressure = neglected.get("reservoir_depletion"), trial.pressure_Pa
+    if reservoir is not None and not reservoir["note"] and pressure > 0:
+        depleted = model + catalogue()["reservoir_depletion"]
+        models = (depleted.with_values({"reservoir_depletion.gamma": gamma}) for gamma in (1.0, 1.4))
+        slow, fast = (1 - float(np.min(motion.terms(each).pressure_Pa)) / pressure for each in models)
+        if fast > 0.05:
+            yield (
+                "reservoir",
+                f"the reservoir of {1e3 * trial.chamber_m3:.3g} L loses {slow:.0%} (slow) to {fast:.0%} (fast) of its "
+                "gauge pressure while the vine grows, above 5%, unless a supply refills it; add reservoir_depletion or "
+                "supply_refill to the model, or measure the pressure",
+            )
     if tension["share_of_drive"] < -DOUBTFUL_COMPRESSION and trial.tail_slack != "free":
         yield (
             "tension",
             f"the model predicts compression in the tail from {1e3 * tension['slack_from_s']:.0f} ms on (tension down "
             f"to {tension['force_N']:.2f} N); `tail_slack: free` lets it go slack",
-        )
-
-
-def _reservoir_rule(model: Model, motion: AuditedMotion, row: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
-    """The reservoir's rule, by the gas law in absolute pressure, for slow and for fast expansion."""
-    pressure = motion.trial.pressure_Pa
-    if row is None or row["note"] or not pressure > 0:
-        return
-    depleted = model + catalogue()["reservoir_depletion"]
-    models = (depleted.with_values({"reservoir_depletion.gamma": gamma}) for gamma in (1.0, 1.4))
-    slow, fast = (1 - float(np.min(motion.terms(each).pressure_Pa)) / pressure for each in models)
-    if fast > 0.05:
-        yield (
-            "reservoir",
-            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {slow:.0%} (slow) to {fast:.0%} (fast) of "
-            "its gauge pressure while the vine grows, above 5%, unless a supply refills it; add reservoir_depletion or "
-            "supply_refill to the model, or measure the pressure",
         )
