@@ -38,7 +38,7 @@ BUDGETS = {
     "laboratory": (1567, 6, 9),
     "narrative": (1048, 3, 8),
     "pages": (2815, 7, 22),
-    "paper": (891, 4, 35),
+    "paper": (869, 4, 35),
     "pipeline": (1982, 7, 6),
     "planning": (1583, 4, 24),
     "report": (750, 3, 4),

@@ -208,7 +208,7 @@ P_Y_FOUND = Number("yield_pressure.P_y", "24mm-200um-280mm", "P_y", "Pa", 2950.0
 FIT = FitSummary(names=("yield_pressure",), numbers=(P_Y_FOUND,))
 
 
-def found(**changes: object) -> lines.ExperimentResults:
+def found(**changes: object) -> dict:
     positions = pd.DataFrame([("c", 7.0, 4, 0.0031, 0.0042)], columns=list(motions.POSITION_COLUMNS))
     speeds = [("a", "v", 14.0, 10.0, 4, 120.0, 1.1, 0.1, 1.0), ("b", "v", 14.0, 20.0, 4, 120.0, 1.3, 0.1, 1.6)]
     speeds = pd.DataFrame(speeds, columns=list(motions.SPEED_COLUMNS))
@@ -220,18 +220,18 @@ def found(**changes: object) -> lines.ExperimentResults:
     conditions = pd.DataFrame([fast]).reindex(columns=list(CONDITION_COLUMNS))
     given: dict = {"damping": DAMPING, "scaling": SCALING, "conditions": conditions, "fit": FIT}
     given |= {"mark": lines.SIMULATED, "positions": positions, "speeds": speeds, "departures": departures}
-    return lines.ExperimentResults(**(given | changes))
+    return given | changes
 
 
-def nothing() -> lines.ExperimentResults:
+def nothing() -> dict:
     columns = {"positions": motions.POSITION_COLUMNS, "speeds": motions.SPEED_COLUMNS}
     columns |= {"departures": motions.DEPARTURE_COLUMNS, "conditions": CONDITION_COLUMNS}
     empty = {name: pd.DataFrame(columns=list(names), dtype=float) for name, names in columns.items()}
     return found(damping={}, scaling={}, fit=FitSummary(()), **empty)
 
 
-def table_rows(of: lines.ExperimentResults) -> pd.DataFrame:
-    return lines.as_table(lines.result_rows(of)).set_index("row")
+def table_rows(of: dict) -> pd.DataFrame:
+    return lines.as_table(lines.result_rows(**of)).set_index("row")
 
 
 def test_what_an_experiment_found_stands_beside_what_is_printed():
@@ -280,7 +280,7 @@ EVERY_NUMBER = {
 
 def test_no_published_number_is_without_its_line():
     steady = pd.DataFrame(columns=["trial", "rule", "accepted", "points", "cv", "drift"]).astype({"accepted": bool})
-    rows = [*lines.protocol_rows([], steady, lines.SIMULATED), *lines.result_rows(nothing())]
+    rows = [*lines.protocol_rows([], steady, lines.SIMULATED), *lines.result_rows(**nothing())]
     whole = lines.as_table([*rows, *lines.computed_rows(), *lines.theory_rows([])])
     assert list(whole.columns) == list(lines.PAPER_COLUMNS)
     by_row = whole.set_index("row")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -165,20 +164,6 @@ def _median(values: Sequence[float]) -> float:
 # The results of an experiment: damping law, positions, speeds, dependence on size.
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExperimentResults:
-    """Files of a results folder, by their names there; `mark` is `SIMULATED` or `MEASURED`."""
-
-    mark: str
-    damping: Mapping[str, Any]
-    scaling: Mapping[str, Any]
-    conditions: pd.DataFrame
-    fit: FitSummary
-    positions: pd.DataFrame
-    speeds: pd.DataFrame
-    departures: pd.DataFrame
-
-
 def paper_tables(
     trials: Sequence[Trial], mark: str, fit: FitSummary, kinematics: Callable[[str], pd.DataFrame],
     steady: pd.DataFrame, **files: Any,
@@ -188,19 +173,22 @@ def paper_tables(
     """
     tables = comparison_tables(trials, fit, kinematics)
     files |= {name: tables[f"paper_{name}"] for name in ("positions", "speeds", "departures")}
-    of_results = result_rows(ExperimentResults(mark=mark, fit=fit, **files))
+    of_results = result_rows(mark, fit, **files)
     rows = [*protocol_rows(trials, steady, mark), *of_results, *computed_rows(), *theory_rows(trials)]
     return tables | {"paper": as_table(rows)}
 
 
-def result_rows(results: ExperimentResults) -> Iterator[Row]:
+def result_rows(
+    mark: str, fit: FitSummary, *, damping: Mapping[str, Any], scaling: Mapping[str, Any], conditions: pd.DataFrame,
+    positions: pd.DataFrame, speeds: pd.DataFrame, departures: pd.DataFrame,
+) -> Iterator[Row]:  # fmt: skip
     """Yield every row that an experiment can answer; where it does not, ours is blank."""
-    yield from _law_rows(results)
-    yield from _motion_rows(results)
-    yield from _scale_rows(results.mark, results.scaling)
-    yield from _wall_rows(results)
-    yield from _efficiency_rows(results.mark, results.scaling)
-    yield _fast_row(results)
+    yield from _law_rows(mark, damping)
+    yield from _motion_rows(mark, fit, positions, speeds, departures)
+    yield from _scale_rows(mark, scaling)
+    yield from _wall_rows(mark, damping, scaling)
+    yield from _efficiency_rows(mark, scaling)
+    yield _fast_row(mark, conditions)
 
 
 def _bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
@@ -215,18 +203,18 @@ def _fitted(line: Mapping[str, Any], key: str = "slope") -> dict[str, Any]:
     return {"ours": or_nan(line.get(key)), "interval": _bounds(line.get(f"{key}_95")), **p}
 
 
-def _law_rows(results: ExperimentResults) -> Iterator[Row]:
-    laws = {method: results.damping.get(method) or {} for method in ("log_log", "both_axes", "paper")}
+def _law_rows(mark: str, damping: Mapping[str, Any]) -> Iterator[Row]:
+    laws = {method: damping.get(method) or {} for method in ("log_log", "both_axes", "paper")}
     for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
         interval = _bounds(law.get("n_95_total"))
-        yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=results.mark)
+        yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=mark)
     for R, printed in published.DAMPING_B.items():
         log_log, ours, literal = (_vine_of(law, R) for law in laws.values())
         B, interval, n = or_nan(ours.get("B")), _bounds(ours.get("B_95_total")), ours.get("n_trials", 0)
         by_rule: Row = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
-        yield row_of("B_R{R}", B, interval, published_as=printed, mark=results.mark, R=R, n=n, **by_rule)
+        yield row_of("B_R{R}", B, interval, published_as=printed, mark=mark, R=R, n=n, **by_rule)
         R2 = or_nan(log_log.get("R2"))
-        yield row_of("R2_R{R}", R2, published_as=published.DAMPING_R2[R], mark=results.mark, R=R)
+        yield row_of("R2_R{R}", R2, published_as=published.DAMPING_R2[R], mark=mark, R=R)
 
 
 def _vine_of(law: Mapping[str, Any], R: int) -> Mapping[str, Any]:
@@ -235,31 +223,32 @@ def _vine_of(law: Mapping[str, Any], R: int) -> Mapping[str, Any]:
     return next((vine for vine in vines if published.scale_of(vine["diameter_mm"], vine["thickness_um"]) == R), {})
 
 
-def _motion_rows(results: ExperimentResults) -> Iterator[Row]:
-    mark = results.mark
+def _motion_rows(
+    mark: str, fit: FitSummary, positions: pd.DataFrame, speeds: pd.DataFrame, departures: pd.DataFrame
+) -> Iterator[Row]:
     for kPa, printed in published.POSITION_RMS_CM.items():
-        lines = _at_pressure(results.positions, kPa)
+        lines = _at_pressure(positions, kPa)
         first: Any = lines.iloc[0] if len(lines) else {"n_trials": 0, "rms_mean_m": nan}
         facts: Row = {
             "n": first["n_trials"],
             "alone": f"; {100 * first['rms_single_m']:.2f} cm over single trials" if len(lines) else "",
-            "departures": departures_in_words(results.departures, "Fig. 4", kPa),
+            "departures": departures_in_words(departures, "Fig. 4", kPa),
         }
         rms_cm = 100 * float(first["rms_mean_m"])
         yield row_of("position_rms_{kPa:g}kPa", rms_cm, published_as=printed, mark=mark, kPa=kPa, **facts)
     pressures = [
         [value / 1e3 for value in (fitted.value, fitted.low, fitted.high)]
-        for fitted in results.fit.numbers
+        for fitted in fit.numbers
         if fitted.key == "yield_pressure.P_y" and fitted.vine.startswith("24mm-200um")
     ]
     yield_kPa, *interval = pressures[-1] if pressures else (nan, nan, nan)
     yield row_of("yield_pressure", yield_kPa, interval, published_as=published.YIELD_PRESSURE_KPA, mark=mark)
     for kPa, printed in published.FINAL_SPEED_RMS_M_S.items():
-        lines = _at_pressure(results.speeds, kPa)
+        lines = _at_pressure(speeds, kPa)
         off = (lines["final_lead_velocity_m_s"] - lines["eq2_lead_velocity_m_s"]).to_numpy(float)
         facts = {
             "payloads": ", ".join(f"{payload:g}" for payload in lines["payload_g"]) or "none",
-            "departures": departures_in_words(results.departures, "Fig. 5", kPa),
+            "departures": departures_in_words(departures, "Fig. 5", kPa),
         }
         yield row_of(
             "final_speed_rms_{kPa:g}kPa", math.sqrt(_mean((off**2).tolist())), published_as=printed, kPa=kPa, **facts
@@ -311,16 +300,16 @@ def _close(ours: float, printed: float) -> bool:
     return math.isclose(ours, printed, rel_tol=0.02)
 
 
-def _wall_rows(results: ExperimentResults) -> Iterator[Row]:
-    vines = (results.damping.get("both_axes") or {}).get("vines") or {}
+def _wall_rows(mark: str, damping: Mapping[str, Any], scaling: Mapping[str, Any]) -> Iterator[Row]:
+    vines = (damping.get("both_axes") or {}).get("vines") or {}
     family: Mapping[str, Any] = {}
-    for candidate in results.scaling.get("thickness") or ():
+    for candidate in scaling.get("thickness") or ():
         diameters_mm = [vines.get(vine, {}).get("diameter_mm", nan) for vine in candidate["vines"]]
         if any(abs(mm / published.THICKNESS_SERIES_DIAMETER_MM - 1) < 0.01 for mm in diameters_mm):
             family = candidate
     walls = ", ".join(f"{size:g}" for size in family.get("sizes", ()))
-    yield row_of("B_power_of_wall", **_fitted(family.get("power") or {}), mark=results.mark, walls=walls)
-    yield row_of("B_wall_line_R2", or_nan((family.get("line") or {}).get("R2")), mark=results.mark, walls=walls)
+    yield row_of("B_power_of_wall", **_fitted(family.get("power") or {}), mark=mark, walls=walls)
+    yield row_of("B_wall_line_R2", or_nan((family.get("line") or {}).get("R2")), mark=mark, walls=walls)
 
 
 def _efficiency_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
@@ -342,8 +331,7 @@ def _efficiency_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
             yield row_of(row, **power, mark=mark, key=key, words=words, n=trend.get("n", 0))
 
 
-def _fast_row(results: ExperimentResults) -> Row:
-    table = results.conditions
+def _fast_row(mark: str, table: pd.DataFrame) -> Row:
     same = np.array(table["payload_g"] == 0)
     for column in ("diameter_mm", "thickness_um", "pressure_kPa"):
         same &= np.isclose(table[column].to_numpy(float), published.FAST_VINE[column], rtol=0.02)
@@ -353,7 +341,7 @@ def _fast_row(results: ExperimentResults) -> Row:
         speed = float(first["final_lead_velocity_m_s"])
         place = f", at {first['final_at_mm']:.0f} mm, N = {int(first['n_final'])}"
     # 60: the printed speed of its leading edge, m/s, as measured
-    return row_of("fast_vine_measured", speed, published_as=60.0, mark=results.mark, place=place)
+    return row_of("fast_vine_measured", speed, published_as=60.0, mark=mark, place=place)
 
 
 # ------------------------------------------------------------------------------
@@ -378,7 +366,14 @@ def computed_rows() -> Iterator[Row]:
     for R in published.DAMPING_B:
         relative = walls_um[R] / diameters_mm[R] / (walls_um[1] / diameters_mm[1])
         yield row_of("isometry_R{R}", relative, published_as=1.0, R=R)
-    yield from _reservoir_rows()
+    change = volume_change(published.CHAMBER_L / 1e3, max(diameters_mm.values()), published.LONGEST_VINE_MM)
+    printed_change, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
+    yield row_of("chamber_volume_change", 100 * change, published_as=printed_change)
+    for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
+        for speed, gamma in GAMMAS.items():
+            drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
+            facts: Row = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
+            yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed_change, allowed=allowed, **facts)
     R2, n = published.STEADY_SPEED_R2, len(published.DAMPING_B)
     yield row_of("steady_speed_p_value", p_value(R2, n), published_as=0.32, n=n)  # 0.32: as printed
     scales, B = (np.array(list(values), dtype=float) for values in (published.DAMPING_B, published.DAMPING_B.values()))
@@ -394,12 +389,18 @@ def computed_rows() -> Iterator[Row]:
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
-    yield from _injector_rows()
+    vine, (length_mm, diameter_mm) = published.INJECTOR, published.INJECTOR_CHAMBER_MM
+    injected = 100 * 0.017  # Relative change of its pressure
+    chamber_m3 = area_m2(diameter_mm) * length_mm / 1e3
+    change = volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
+    slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
+    yield row_of("injector_volume_change", 100 * change, published_as=injected)
+    yield row_of("injector_gauge_drop", slow, published_as=injected, fast=fast)
     for R, printed in published.DAMPING_B.items():
         guess = damping_prior(diameters_mm[R] / 1e3, walls_um[R] / 1e6)
         yield row_of("guessed_B_R{R}", guess, published_as=printed, R=R)
-    fast = published.FAST_VINE
-    stress_Pa = hoop_stress_Pa(1e3 * fast["pressure_kPa"], fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
+    vine = published.FAST_VINE
+    stress_Pa = hoop_stress_Pa(1e3 * vine["pressure_kPa"], vine["diameter_mm"] / 1e3, vine["thickness_um"] / 1e6)
     yield row_of("fast_vine_hoop_stress", stress_Pa / 1e6, burst_MPa=BURST_STRESS_PA / 1e6)
     # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
     pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
@@ -407,27 +408,6 @@ def computed_rows() -> Iterator[Row]:
     errors = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
     worst = int(np.argmax(errors))
     yield row_of("pressure_rounding", 100 * errors[worst], kPa=pressures_kPa[worst], exact=exact[worst])
-
-
-def _reservoir_rows() -> Iterator[Row]:
-    change = volume_change(published.CHAMBER_L / 1e3, max(published.DIAMETER_MM.values()), published.LONGEST_VINE_MM)
-    printed, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
-    yield row_of("chamber_volume_change", 100 * change, published_as=printed)
-    for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
-        for speed, gamma in GAMMAS.items():
-            drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
-            facts: Row = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
-            yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed, allowed=allowed, **facts)
-
-
-def _injector_rows() -> Iterator[Row]:
-    vine, (length_mm, diameter_mm) = published.INJECTOR, published.INJECTOR_CHAMBER_MM
-    printed = 100 * 0.017  # Relative change of its pressure
-    chamber_m3 = area_m2(diameter_mm) * length_mm / 1e3
-    change = volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
-    slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
-    yield row_of("injector_volume_change", 100 * change, published_as=printed)
-    yield row_of("injector_gauge_drop", slow, published_as=printed, fast=fast)
 
 
 # ------------------------------------------------------------------------------
@@ -448,11 +428,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
         facts: Row = {"percent": 100 * fraction, "by_print": 100 * by_print}
         # 5 %: the largest part of the drive that drag is stated to be
         yield row_of("drag_share_{percent:.0f}", 100 * share, published_as=5.0, **facts)
-    yield from _rule_rows(trials)
-
-
-def _rule_rows(trials: Sequence[Trial]) -> Iterator[Row]:
-    """Bias of the published rule in noise-free motions, with a full and with a depleting chamber."""
+    # Bias of the published rule in noise-free motions, with a full and with a depleting chamber
     chosen: dict[str, Trial] = {}
     for trial in trials:
         scale = published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
@@ -462,6 +438,7 @@ def _rule_rows(trials: Sequence[Trial]) -> Iterator[Row]:
         return
     cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
     for row, gamma in cases.items():
-        n, B = rule_on_noise_free(gamma, list(chosen.values()))
-        facts: Row = {"B": ", ".join(f"{B[R]:.2f}" for R in sorted(B)), "scales": ", ".join(map(str, sorted(B)))}
+        n, found = rule_on_noise_free(gamma, list(chosen.values()))
+        scales = sorted(found)
+        facts = {"B": ", ".join(f"{found[R]:.2f}" for R in scales), "scales": ", ".join(map(str, scales))}
         yield row_of(row, n, published_as=published.EXPONENT, n=len(chosen), **facts)
