@@ -16,7 +16,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,27 +25,13 @@ import typer
 
 from vinetrack.core.problems import ExperimentError, InputError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
+from vinetrack.core.terminal import waiting
 from vinetrack.experiment.schema import COLUMNS, Column, option
 
 # ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
 
 START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
-
-
-@contextmanager
-def progress_line() -> Iterator[Callable[[str], None]]:
-    """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
-
-    def show(text: str) -> None:
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r\x1b[K{text}")
-            sys.stderr.flush()
-
-    try:
-        yield lambda step: show(f"{step} …")
-    finally:
-        show("")
 
 
 @contextmanager
@@ -127,8 +113,10 @@ def command(
             values = {line["field"]: _value(line, given[line["field"]]) for line in table}
             log, json_file = values.pop("log", None), values.get("json")
             with errors_as_sentences(log):
-                with progress_line() as report:
-                    tools = {"say": partial(_print_line, err=json_file == STANDARD_OUTPUT), "report": report}
+                tools: dict[str, Any] = {"say": partial(_print_line, err=json_file == STANDARD_OUTPUT)}
+                on_terminal: Any = waiting("starting") if "report" in wanted and sys.stderr.isatty() else nullcontext()
+                with on_terminal as bar:
+                    tools["report"] = lambda step: bar and bar.update(bar.task_ids[0], description=step)
                     named = {name: value for name, value in {**values, **tools}.items() if name in wanted}
                     if "options" in wanted:
                         options = {name: value for name, value in values.items() if name not in {*wanted, "json"}}
