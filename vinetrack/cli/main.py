@@ -40,7 +40,7 @@ def _exit_despite_threads(status: str | int | None) -> None:
     such a thread within compiled code, which sometimes aborts the process (status -6). Files are written atomically, so
     nothing is lost by not waiting.
     """
-    from vinetrack.pages.local_page import THREAD_PREFIX
+    from vinetrack.core.threads import THREAD_PREFIX
 
     if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
         return

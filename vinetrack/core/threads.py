@@ -7,6 +7,8 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
+
 
 def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function by numba; the compiled form is kept, unless no folder for it can be written."""

@@ -9,31 +9,27 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import UserError, reasons_told
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.core.threads import THREAD_PREFIX, in_one_blas_thread
 from vinetrack.diagnosis.ladder import rms_of
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
+from vinetrack.experiment.folder import Experiment
 from vinetrack.figures.registry import condition_label
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
+from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.inference.fit_summary import FitSummary
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,24 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
+from tornado.netutil import bind_sockets
+from tornado.routing import Router
+from tornado.web import Application, ErrorHandler
 
 from vinetrack.core.problems import UserError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from tornado.web import Application
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
 TEMPLATES = Path(__file__).with_name("templates")
 TOKENS_CSS = Path(__file__).parents[1] / "report" / "templates" / "page_tokens.css"  # Colours of either scheme
-
-THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
 
 def page_frame() -> str:
@@ -38,12 +41,6 @@ class PageServer:
     """
 
     def __init__(self, make: Callable[[str], Application], port: int | None) -> None:
-        from tornado.httpserver import HTTPServer
-        from tornado.ioloop import IOLoop
-        from tornado.netutil import bind_sockets
-        from tornado.routing import Router
-        from tornado.web import ErrorHandler
-
         self.loop = IOLoop.current()
         for number in [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]:
             with contextlib.suppress(OSError):
@@ -97,9 +94,6 @@ class PageServer:
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:
     """Return a grey picture as JPEG. Shapes: picture (height, width)."""
-    import cv2
-    import numpy as np
-
     if picture.dtype != np.uint8:
         scale = 255 / max(float(picture.max()) if white is None else white, 1.0)
         picture = (np.nan_to_num(picture.astype(np.float32)) * scale).clip(0, 255).astype(np.uint8)

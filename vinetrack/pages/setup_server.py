@@ -15,6 +15,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import to_json
@@ -24,6 +25,7 @@ from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandle
 from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError
 from vinetrack.core.records import Correction
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join
+from vinetrack.core.threads import THREAD_PREFIX
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
@@ -32,7 +34,7 @@ from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read
 from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.style import render
 from vinetrack.pages import draft_files as files
-from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, TOKENS_CSS, PageServer, jpeg, page_frame
+from vinetrack.pages.local_page import TEMPLATES, TOKENS_CSS, PageServer, jpeg, page_frame
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.report.build import TOKENS, base64_uri
@@ -162,8 +164,6 @@ def ruler_in(picture: NDArray[Any]) -> dict[str, Any] | None:
     """Find the longest row of equally spaced marks in a picture of shape (height, width): two far marks, px, the number
     of spacings between them, and by what share the last is longer than the first. None if there is no such row.
     """
-    import cv2
-
     grey = picture.astype(np.float32)
     small = min(1.0, 1000 / max(grey.shape))  # 1000: size at which directions are searched, px (chosen)
     shrunk = cv2.resize(grey, None, fx=small, fy=small, interpolation=cv2.INTER_AREA)
@@ -233,8 +233,6 @@ def _levels(
     grey: NDArray[Any], start: NDArray[Any], way: NDArray[Any], u: NDArray[Any], smooth_px: float
 ) -> NDArray[Any]:
     """Grey levels along a line, without their slow change; 0 outside the picture."""
-    import cv2
-
     x, y = (start[:, None] + u * way[:, None]).astype(np.float32)[:, None]
     seen = (x > 0) & (x < grey.shape[1] - 1) & (y > 0) & (y < grey.shape[0] - 1)
     level = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
