@@ -19,7 +19,7 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
-from vinetrack.results import origin
+from vinetrack.results import folder_layout as origin
 from vinetrack.results.folder_layout import TRIALS_COLUMNS, Results, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated
 
@@ -239,7 +239,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
 BEGIN = """
 import time
 from pathlib import Path
-from vinetrack.results.origin import begin_run
+from vinetrack.results.folder_layout import begin_run
 lock = begin_run(Path("results/vines"), Path("vines"))
 print("begun", flush=True)
 time.sleep(60)

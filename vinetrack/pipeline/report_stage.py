@@ -32,12 +32,12 @@ from vinetrack.report.clips import recording_facts, write_overlay, write_recordi
 from vinetrack.results.folder_layout import (
     Results,
     ResultsError,
+    describe_run,
     read_fit,
     read_json,
     read_result,
     read_source_experiment,
 )
-from vinetrack.results.origin import describe_run
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.survey import measure_recording
 

@@ -24,7 +24,7 @@ from vinetrack.core.problems import ExperimentError, InputError, Problem, UserEr
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import waiting
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
-from vinetrack.results.origin import CLAIM_FILE, claim, locked, refuse_shared_results
+from vinetrack.results.folder_layout import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
