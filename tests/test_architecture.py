@@ -26,12 +26,12 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (675, 3, 5),
-    "core": (950, 7, 25),
+    "core": (982, 7, 26),
     "diagnosis": (5830, 14, 87),
     "dynamics": (2265, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
-    "figures": (1996, 8, 29),
+    "figures": (2092, 8, 30),
     "inference": (5185, 14, 49),
     "interface": (567, 2, 2),
     "kinematics": (1618, 6, 12),

@@ -129,7 +129,13 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
         problems.append(Problem("missing", "is missing", name, file=SHEET, remedy=remedy))
     corrections, faults = read_corrections(folder)
-    problems += [*faults, *_unmatched(corrections, rows)]
+    problems += faults
+    filmed = {row.name: "video" in row.values for row in rows}
+    for trial in corrections:
+        if not filmed.get(trial):
+            message = f"is not {'a recording' if trial in filmed else 'in the sheet'}; its corrections are ignored"
+            place: dict[str, Any] = {"file": CORRECTIONS_FILE, "value": trial, "severity": "warning"}
+            problems.append(Problem("ignored", message, "trial", **place))
     sheet_is_sound = not (_names_repeat(rows) or any(problem.severity == "error" for problem in problems))
     vines = [row for row in in_use if row.travel_ratio == 2]
     may_be_blank = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
@@ -366,15 +372,6 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
     return {name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()}, problems
 
 
-def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:
-    """Warn of corrections of a trial that is not in the sheet, or is not a recording."""
-    filmed = {row.name: "video" in row.values for row in rows}
-    for trial in corrections:
-        if not filmed.get(trial):
-            message = f"is not {'a recording' if trial in filmed else 'in the sheet'}; its corrections are ignored"
-            yield Problem("ignored", message, "trial", file=CORRECTIONS_FILE, value=trial, severity="warning")
-
-
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     """Return the content of `corrections.csv` for these corrections."""
     from pandas import DataFrame
@@ -463,16 +460,11 @@ def check_experiment(
         readable += [trial] if trial.video and not found else []
     if readable and open_videos is not None:
         of_trials += open_videos(experiment, readable)
-    return problems + [_with_location(problem, experiment) for problem in of_trials]
-
-
-def _with_location(problem: Problem, experiment: Experiment) -> Problem:
-    """Add the location to a trial's problem: its line in the sheet, or the settings if only they state the value."""
-    if not problem.trial:
-        return problem
-    if problem.column in SHARED and problem.column not in experiment.columns:
-        return replace(problem, file=SETTINGS)
-    return replace(problem, file=SHEET, line=experiment.lines[problem.trial])
+    for problem in of_trials:
+        in_settings = problem.column in SHARED and problem.column not in experiment.columns  # which alone state it
+        place = {"file": SETTINGS} if in_settings else {"file": SHEET, "line": experiment.lines.get(problem.trial)}
+        problems.append(replace(problem, **place) if problem.trial else problem)
+    return problems
 
 
 def _check_track(trial: Trial) -> list[Problem]:

@@ -44,8 +44,16 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     fig, ax = st.one_panel(8.6, 5.6, xscale="log", yscale="log")
     ax.set(xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
     for vine, group in drawable.groupby("vine", sort=False):
+        style = styles[str(vine)]
         for used, part in group.groupby("used"):
-            _draw_points(ax, part, styles[str(vine)], bool(used))
+            x, y = st.column(part, "x_ss_m_s"), st.column(part, "force_N")
+            x_sigma, y_sigma = (np.nan_to_num(st.column(part, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
+            # The lower bar ends above zero, which logarithmic axes cannot show.
+            ax.errorbar(
+                x, y, xerr=[np.minimum(x_sigma, 0.9 * x), x_sigma], yerr=[np.minimum(y_sigma, 0.9 * y), y_sigma],
+                fmt=style.marker, color=style.colour, mfc=style.colour if used else st.PAPER, ms=5, mew=1.1,
+                elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3,
+            )  # fmt: skip
     fits = {method: damping.get(method) or {} for method in METHOD_NAMES}
     for method, fit in fits.items():
         for vine, law in (fit.get("vines") or {}).items():
@@ -59,17 +67,6 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     ax.set_title(law or "Steady force and speed (no fit: see the report)")
     _law_legend(fig, drawable, fits, styles)
     return fig
-
-
-def _draw_points(ax: Axes, points: pd.DataFrame, style: st.VineStyle, used: bool) -> None:
-    """Points with bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
-    x, y = st.column(points, "x_ss_m_s"), st.column(points, "force_N")
-    x_sigma, y_sigma = (np.nan_to_num(st.column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
-    ax.errorbar(
-        x, y, xerr=[np.minimum(x_sigma, 0.9 * x), x_sigma], yerr=[np.minimum(y_sigma, 0.9 * y), y_sigma],
-        fmt=style.marker, color=style.colour, mfc=style.colour if used else st.PAPER, ms=5, mew=1.1, elinewidth=0.8,
-        alpha=0.85 if used else 0.6, zorder=3,
-    )  # fmt: skip
 
 
 def _draw_law(

@@ -79,13 +79,9 @@ def all_figures() -> dict[str, RegisteredFigure]:
 
 
 def figures_of(*sections: str) -> dict[str, RegisteredFigure]:
-    """Return the figures of some sections of the page by name."""
-    return {name: one for section in sections for name, one in all_figures().items() if one.section == section}
-
-
-def campaign_figures() -> dict[str, RegisteredFigure]:
-    """Return the figures of a whole experiment by name, those of its diagnosis last."""
-    return figures_of("damping", "model", *DIAGNOSIS_SECTIONS)
+    """Return the figures of some sections of the page by name; without any, of all that an experiment has."""
+    chosen = sections or ("damping", "model", *DIAGNOSIS_SECTIONS)
+    return {name: one for section in chosen for name, one in all_figures().items() if one.section == section}
 
 
 def draw(name: str, tables: Any) -> Figure | None:

@@ -34,7 +34,7 @@ from vinetrack.experiment.folder import (
 )
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.figures.prediction_figures import draw_power
-from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
+from vinetrack.figures.registry import FigureTables, describe_conditions, draw, figures_of, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
@@ -340,14 +340,14 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
 
 def _draw_figure(tables: Any, name: str = "") -> Figure:
     """Draw a figure, or the first with content; only the tables that it shows are read."""
-    asked = [one for one in campaign_figures().values() if name in ("", one.name)]
+    asked = [one for one in figures_of().values() if name in ("", one.name)]
     drawn = (draw(one.name, tables) for one in asked if all(hasattr(tables, table) for table in one.reads))
     return _with_content(next(filter(None, drawn), None), name)
 
 
 def _with_content(drawn: Figure | None, name: str) -> Figure:
     if drawn is None:
-        names = ", ".join(campaign_figures())
+        names = ", ".join(figures_of())
         raise ResultsError(f"There is no figure {name!r} with content; figures are {names}, trial_motion and power.")
     return drawn
 

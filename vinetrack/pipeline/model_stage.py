@@ -197,7 +197,13 @@ def write_diagnosis(
     tables |= diagnosis_tables(diagnosis)
     folder = _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
-        tables["damping_laws.csv"] = _laws(diagnosis, motions(), settings)
+        laws, of_trials = {}, motions()  # with the pressure that each model of the ladder predicts
+        for fit in diagnosis.fits:
+            try:
+                laws["+".join(fit.model.names)] = redo_damping(fit.model, of_trials, settings)
+            except ValueError as error:
+                log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
+        tables["damping_laws.csv"] = law_table(laws) if laws else table_of(LAW_COLUMNS)
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
@@ -221,17 +227,6 @@ def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
         if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
             return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
     return ladder
-
-
-def _laws(diagnosis: Diagnosis, motions: list[TrialMotion], settings: RunSettings) -> pd.DataFrame:
-    """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
-    laws = {}
-    for fit in diagnosis.fits:
-        try:
-            laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
-        except ValueError as error:
-            log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
-    return law_table(laws) if laws else table_of(LAW_COLUMNS)
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:

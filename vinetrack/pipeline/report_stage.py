@@ -22,7 +22,7 @@ from vinetrack.core.terminal import table
 from vinetrack.core.units import number
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import ExperimentSettings, FigureSettings, OverlaySettings, read_experiment_settings
-from vinetrack.figures.registry import FigureTables, campaign_figures, draw, figures_of
+from vinetrack.figures.registry import FigureTables, draw, figures_of
 from vinetrack.figures.style import render
 from vinetrack.paper import rows as paper
 from vinetrack.pipeline.stages import Job, map_unordered
@@ -120,7 +120,7 @@ def draw_figures(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
     job.say("drawing figures")
     import_module("matplotlib.backends.backend_svg")  # once, before processes are forked
-    names = [*campaign_figures(), *(figures_of("paper") if job.experiment.settings.published else ())]
+    names = [*figures_of(), *(figures_of("paper") if job.experiment.settings.published else ())]
     shares = [names[first :: job.threads] for first in range(job.threads)]
     work = partial(_drawn, folder=job.results, trials=job.experiment.trials, settings=job.settings.figures)
     return [f"{sum(map_unordered(work, shares, job.threads))} figures."]

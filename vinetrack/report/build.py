@@ -23,7 +23,7 @@ from vinetrack.core.units import display_unit, interval, number, pressure_text, 
 from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.experiment.schema import LIMITED
-from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
+from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, figures_of
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION, rows
 from vinetrack.narrative import sentence
 from vinetrack.narrative.diagnosis_text import LAW_METHODS, POWER_COLUMNS, damping_headline, power_rows, status_tally
@@ -399,7 +399,7 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
         "trials": trials,
         "damping": read_json(results.damping),
         "provenance": provenance,
-        "figures": _figures(tables, campaign_figures().values()),
+        "figures": _figures(tables, figures_of().values()),
         "pictures": {name: _pictures(results, name) for name in drawn},
         "calibrations": {name: one for name, one in seen.items() if one},
         "clip": _clip(results, tables.diagnosed, trials),
