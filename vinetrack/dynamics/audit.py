@@ -53,9 +53,7 @@ def evaluate(
     *,
     measured_Pa: Floats | None = None,
 ) -> Terms:
-    """Evaluate every effect of the model along a motion since release. Shapes: time_s, lead_position_m,
-    lead_velocity_m_s, measured_Pa (n,).
-    """
+    """Evaluate every effect of the model along a motion since release. All arrays have shape (n,)."""
     check_needs(model, trial)
     hooks = _Hooks(model, trial, measured=measured_Pa is not None)
     rig = hooks.rig
@@ -220,9 +218,7 @@ class AuditedMotion:
 
 @dataclass(frozen=True)
 class RuleViolation:
-    """A rule for neglecting an effect (drag, length, bends, reservoir, tension) that a trial violates, and how, in
-    words. The limits are those that Alvarez et al. (2025) state.
-    """
+    """A rule for neglecting an effect that a trial violates, and how, in words; limits by Alvarez et al. (2025)."""
 
     trial: str
     rule: str

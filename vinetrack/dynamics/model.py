@@ -98,9 +98,7 @@ class Model(Printed):
     # A fit determines several thousand times which effects act; the part that depends on the model alone is cached.
     @cached_property
     def sized_and_replaced(self) -> tuple[list[int], list[int], list[tuple[int, int]]]:
-        """Indices of the effects that have parameters, where the parameters of each begin; and pairs of indices: an
-        effect, and one that it replaces.
-        """
+        """Indices of effects with parameters, and where those of each begin; pairs: an effect, and one it replaces."""
         sized = [i for i, effect in enumerate(self.effects) if effect.parameters]
         replaces = [(i, name) for i, effect in enumerate(self.effects) for name in effect.replaces]
         pairs = [(i, self.names.index(name)) for i, name in replaces if name in self.names]

@@ -93,9 +93,7 @@ def simulate_many(
     host: Model | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> list[Trajectory]:
-    """Simulate many trials in one call of the compiled kernel, see `simulate`. Shapes: parameters (n_trials,
-    n_parameters).
-    """
+    """Simulate many trials in one call of the kernel, see `simulate`. Shapes: parameters (n_trials, n_parameters)."""
     check_needs(model, *trials)
     inputs = np.array([TrialInputs.of(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
     if parameters is None:

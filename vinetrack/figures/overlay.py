@@ -128,9 +128,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class ClipView:
-    """What all frames of a clip have in common: edges, size of the recording, scale along the axis, factor of the slow
-    motion.
-    """
+    """What all frames of a clip have in common: edges, size of the recording, scale along the axis, slow motion."""
 
     title: str
     axis: Axis

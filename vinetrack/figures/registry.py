@@ -34,9 +34,7 @@ _Drawing = TypeVar("_Drawing", bound="Callable[..., Figure | None]")
 
 @dataclass(frozen=True)
 class RegisteredFigure:
-    """One figure of a results folder. `data` is a file of the folder, or the name of a table (no dot), to download
-    beside it.
-    """
+    """A figure of a results folder; `data`, to download beside it, is a file of it or the name of a table (no dot)."""
 
     name: str
     section: str
@@ -280,9 +278,7 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, with its
-    error as found there, for the figure `where`.
-    """
+    """The mean misfit of every condition in the sections of its growth, with its error, for the figure `where`."""
     import pandas as pd
 
     if located.empty:

@@ -403,9 +403,7 @@ def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
     radius_px: float, sigma_px: float, surface: Image, min_along: float,
 ) -> None:  # fmt: skip
-    """Draw a ball over `out`, averaged over its positions `path_px` during the exposure. Shapes: out, along, across
-    (height, width); path_px (n_pieces,).
-    """
+    """Draw a ball over `out`, (height, width), averaged over its positions `path_px`, (n_pieces,), in the exposure."""
     half = (surface.shape[0] - 1) // 2
     first, last = path_px.min() - half, path_px.max() + half
     for y in range(out.shape[0]):
@@ -536,9 +534,7 @@ class SceneMotion:
         return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
-        """Return the displacement of the picture (x, y), plane pixels: six sinusoids of joint rms 1, and a damped kick
-        at release.
-        """
+        """Return the shift of the picture (x, y), plane px: six sinusoids of joint rms 1, a damped kick at release."""
         if not self.scene.shake_px:
             return 0.0, 0.0
         sway = (self._amplitude * np.sin(2 * np.pi * self._hertz * time_s + self._phase)).sum(axis=1)
@@ -635,9 +631,7 @@ class TubeLayer:
 
 
 def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
-    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core, each of
-    shape (n_entries,).
-    """
+    """Profiles across the axis, PROFILE_PER_PX a pixel, shape (n_entries,): setback, slope row, side, core."""
     half = math.ceil((radius_px + 5) * PROFILE_PER_PX)
     v = np.abs(np.arange(-half, half + 1)) / PROFILE_PER_PX
     corner = max(tube.tip_roundness * radius_px, 1e-6)
@@ -663,9 +657,7 @@ class BallLayer:
         self._surface = ball_surface(ball, rng, max(self._radius_px, 2.0))
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the ball over a picture, in place, averaged over centres at most 0.7 px apart. Shapes: light
-        (height, width).
-        """
+        """Lay the ball over a picture, shape (height, width), in place, averaged over centres at most 0.7 px apart."""
         scene_motion = self._motion
         begin_s, span_s = frame / scene_motion.capture_fps, scene_motion.exposure_s
         ends = self._centre_px(begin_s + np.array([0, span_s]))
@@ -718,9 +710,7 @@ def lay_door(light: Image, scene_motion: SceneMotion, door: Door, frame: int, sh
 
 @dataclass(frozen=True)
 class Truth:
-    """True positions in a recording, one entry per frame, shape (n_frames,). `time_s` is mid-exposure; `in_frame` tells
-    whether the tip is inside the picture.
-    """
+    """True positions, shapes (n_frames,); `time_s` is mid-exposure, `in_frame` whether the tip is in the picture."""
 
     time_s: Floats
     lead_position_m: Floats
@@ -796,9 +786,7 @@ class FrameRenderer:
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None
     ) -> NDArray[np.uint8 | np.uint16]:
-        """Convert radiance to grey levels with the lamps, gain and noise of one frame. Shapes: light (height, width) →
-        (height, width).
-        """
+        """Convert radiance, shape (height, width), to grey levels with the lamps, gain and noise of one frame."""
         sensor = self.scene.sensor
         out = np.empty(light.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
         well_e = sensor.full_well_e if sensor.noise else 0.0

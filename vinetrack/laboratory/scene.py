@@ -124,9 +124,7 @@ class Target:
 
 @dataclass(frozen=True, kw_only=True)
 class Tube:
-    """An everting tube, seen from the side. `opacity` is that of the everted wall, both layers, at the middle of the
-    tube; `brightness` that of opaque film.
-    """
+    """An everting tube from the side; `opacity` is of both layers at its middle, `brightness` of opaque film."""
 
     diameter_m: float = 0.024
     length_m: float = 0.280
@@ -158,9 +156,7 @@ class Ball:
 
 @dataclass(frozen=True, kw_only=True)
 class Door:
-    """The latched door in front of the tip. It starts to swing `lead_s` before the tip moves and is open after
-    `swing_s`.
-    """
+    """The latched door before the tip. It starts to swing `lead_s` before the tip moves and is open after `swing_s`."""
 
     brightness: float = 0.55
     length_m: float = 0.034

@@ -185,8 +185,6 @@ def campaign(
 
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
-    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n. Returns values
-    as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
-    """
+    """Parameters of isometric vines as `GroundTruth.values` takes them: the printed B by vine, N·(s/m)ⁿ, and n."""
     by_vine = {trial.vine: published.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": published.EXPONENT}

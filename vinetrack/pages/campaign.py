@@ -62,9 +62,7 @@ class ExplorerTrial:
 
     @cached_property
     def rows(self) -> slice:
-        """The frames to draw, from a little before the end of the rest: rest would take most of a figure, and points
-        closer than a pixel need not be sent.
-        """
+        """The frames to draw, from a little before the end of the rest; points closer than a pixel are left out."""
         count = self.time_s.size
         first = min(int(np.searchsorted(self.data.time_s, self.release_s)), max(self.data.n_rest - 1, 0), count - 1)
         begin = max(first - max((count - first) // 20, 2), 0)
@@ -74,9 +72,7 @@ class ExplorerTrial:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A results folder with its experiment, read by `read_campaign`. `stored` is its fit; `in_use` are the effects of
-    the model that the results are of.
-    """
+    """A results folder with its experiment. `stored` is its fit, `in_use` the effects of the model it is of."""
 
     folder: Path
     experiment: Experiment
@@ -188,9 +184,7 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction of every trial of a campaign, in its order, and the root mean square error of position by
-    condition and in all, m.
-    """
+    """A model's prediction of every trial of a campaign, and the rms error of position by condition and in all, m."""
 
     trials: tuple[TrialFit, ...]
     errors_m: Mapping[str, float]

@@ -54,9 +54,7 @@ _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
 
 def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
-    """A cell of the column `name`, with or without a unit of its own, in the unit of another of the same quantity;
-    numbers get the decimal mark.
-    """
+    """A cell of the column `name`, or with its own unit, in the unit of `column`; numbers get the decimal mark."""
     number, unit = value_and_unit(cell, name)
     if not _NUMBER.fullmatch(number):
         return cell
@@ -397,9 +395,7 @@ def place_block(
 
 
 def _header_words(columns: Sequence[str]) -> dict[str, str]:
-    """The column that a word of a header names, in its unit; `trial` for names of recordings. Without a unit a word
-    names the column of the table, if that has one.
-    """
+    """The column that a word of a header names, in its unit if it has one; `trial` for names of recordings."""
     words: dict[str, str] = {}
     for name in (*COLUMNS, *columns):
         words |= {written.lower(): written for written in (*other_units(name), name)} | {quantity(name).lower(): name}
@@ -560,9 +556,7 @@ def _clean(name: str) -> str:
 
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, its byte-order mark and line ends kept, and add files to `effects:`; return
-    the path.
-    """
+    """Set `model:` in `experiment.yaml`, byte-order mark and line ends kept, and extend `effects:`; return the path."""
     path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
     before = path.read_bytes() if path.exists() else b""
     text = read_text(path) if before else ""

@@ -140,9 +140,7 @@ class SizeSlider:
 
 
 class EffectPanel:
-    """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` whenever a tick or a
-    size changes.
-    """
+    """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` at each change."""
 
     def __init__(
         self,

@@ -219,9 +219,7 @@ class Plots:
             self._on_condition_click(self.campaign.conditions[-1 - new[0]])
 
     def _lines(self, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
-        """One line per trial, from its abscissae and ordinates in SI, scaled by 1000; none is drawn across frames that
-        were left out.
-        """
+        """One line per trial, from abscissae and ordinates in SI, scaled by 1000; none crosses frames left out."""
         columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
         for aligned, x, y in lines:
             gaps = np.diff(np.cumsum(aligned.data.first)[aligned.rows], prepend=0) > 0
@@ -268,9 +266,7 @@ class Plots:
     def draw(
         self, now: Prediction, reference: Prediction | None, shown: Sequence[int], conditions: Sequence[str]
     ) -> None:
-        """Draw the current model, and the one for comparison where it is another; errors of conditions that are not
-        selected are faint.
-        """
+        """Draw the current model, and another for comparison; errors of conditions that are not selected are faint."""
         trials = self.campaign.trials
         residual = self._lines((trials[i], trials[i].growth_m, now.trials[i].residual_m) for i in shown)
         largest_mm = max((float(np.nanmax(np.abs(part))) for part in residual["ys"]), default=0.0)

@@ -51,9 +51,7 @@ from vinetrack.video.track import Tracking
 
 
 def decoded_clip(path: Path, _changed_ns: int) -> tuple[tuple[bytes, ...], dict[str, Any]]:
-    """Decode a recording: its frames as JPEG, and their number and size with the axis found from the motion, or the
-    reason why there is none.
-    """
+    """Decode a recording: its frames as JPEG; their number and size, with the axis found, or why there is none."""
     frames = read_frames(path)
     height, width = frames.luma.shape[1:]
     found: dict[str, Any] = {"axis": None, "no_axis": ""}

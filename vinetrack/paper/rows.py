@@ -168,9 +168,7 @@ def paper_tables(
     trials: Sequence[Trial], mark: str, fit: FitSummary, kinematics: Callable[[str], pd.DataFrame],
     steady: pd.DataFrame, **files: Any,
 ) -> dict[str, pd.DataFrame]:  # fmt: skip
-    """Return the tables of the paper's figures, and `paper` with every number, by name. `kinematics` reads those of a
-    trial; `files` are `damping`, `scaling` and `conditions`.
-    """
+    """Return the tables of the paper's figures, and `paper` with every number; `kinematics` reads those of a trial."""
     tables = comparison_tables(trials, fit, kinematics)
     files |= {name: tables[f"paper_{name}"] for name in ("positions", "speeds", "departures")}
     of_results = result_rows(mark, fit, **files)

@@ -189,9 +189,7 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 def write_diagnosis(
     results: Results, diagnosis: Diagnosis, motions: Callable[[], list[TrialMotion]], settings: RunSettings
 ) -> None:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; the motions of all trials only where a model was
-    extended.
-    """
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; `motions` are needed if a model was extended."""
     ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
     tables = {"damping_laws.csv": table_of(LAW_COLUMNS), "steps.csv": all_steps(results, ladder)}
     tables |= diagnosis_tables(diagnosis)

@@ -310,9 +310,7 @@ def filming(fit: Fit) -> tuple[int, float]:
 
 
 def _courses(fit: Fit, blanks: Sequence[tuple[Condition, FitTrial]]) -> list[tuple[Jobs, Trajectory | None]]:
-    """Job and trajectory of trials that are released at time and position 0, as the fit predicts them; None for those
-    that cannot be simulated, found by bisection.
-    """
+    """Job and trajectory of trials released at time and position 0; None, by bisection, if one cannot be simulated."""
     predictor, _, state = extended(fit, blanks)
     state.trial_effects[len(fit.trials) :] = 0.0
     jobs = predictor.jobs(state.theta, state.trial_effects)[len(fit.trials) :]
@@ -402,9 +400,7 @@ def tracks_of(
     times_s: Sequence[Floats] | None = None,
     model: Model | None = None,
 ) -> list[tuple[Trial, Track]]:
-    """Tracks of simulated trials, by the model of a fit or another, up to the end of growth and with its noise; at the
-    times of the trials unless at other ones.
-    """
+    """Tracks of simulated trials up to the end of growth, with the noise of a fit; at its times, or others."""
     tracks = []
     times_s = times_s or [predictor.data[i].time_s for i in jobs.trial]
     for i, time_s, trajectory in zip(jobs.trial.tolist(), times_s, predictor.run(jobs, times_s, model), strict=True):

@@ -170,9 +170,7 @@ class VinePrediction:
 
     @cached_property
     def neglected(self) -> tuple[Neglected, ...]:
-        """The final speed at the medians with each of the universal effects that the model leaves out, by itself,
-        largest change first; without those whose columns are blank.
-        """
+        """The final speed at the medians with each universal effect that the model leaves out, largest change first."""
         host, trial = host_for(self.inputs.model), self.inputs.trial
         # Radial strain of a thin-walled closed tube under hoop stress PD/2t and a quarter of it along the tube, ν = ½.
         # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
@@ -306,9 +304,7 @@ def predict_vine(
 def _forces(
     model: Model, trials: Sequence[Trial], rows: Floats, moved: Sequence[Trajectory], places_m: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Tension, N, and pressure, Pa, at the places, shape (n_trials, n_places); least tension, N, and whether the tail
-    is compressed or slack, shape (n_trials,).
-    """
+    """Tension, N, and pressure, Pa, (n_trials, n_places); least tension, N, and whether it is slack, (n_trials,)."""
     of_trials = []
     for trial, row, m in zip(trials, rows.tolist(), moved, strict=False):
         valued = replace(model, values=dict(zip(model.parameter_names, row, strict=True)))
@@ -486,9 +482,7 @@ def chamber_for(trial: Trial, loss: float, gamma: float) -> float:
 
 
 def chambers(trial: Trial, loss: float) -> dict[str, float]:
-    """Return the volumes of the chambers to compare, m³: the stated one, those that keep the pressure, and the one by
-    gauge pressure.
-    """
+    """Return the volumes of the chambers to compare, m³: the stated one, those that keep the pressure, a wrong one."""
     return {
         **({"asked about": trial.chamber_m3} if math.isfinite(trial.chamber_m3) else {}),
         **{f"needed if {law.split(',')[0]}": chamber_for(trial, loss, gamma) for law, gamma in GAMMAS.items()},

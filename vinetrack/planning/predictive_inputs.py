@@ -151,9 +151,7 @@ class Band:
 
 @dataclass(frozen=True)
 class PredictiveInputs:
-    """The distributions from which one trial is predicted. `spreads` are the relative between-trial standard deviations
-    of pressure and B.
-    """
+    """The distributions from which a trial is predicted; `spreads`: relative between-trial sd of pressure and B."""
 
     trial: Trial
     model: Model
@@ -180,9 +178,7 @@ class PredictiveInputs:
         return {name: np.clip(values, *bounds.get(name, (0.0, math.inf))) for name, values in draws.items()}
 
     def drawn_trials(self, count: int, seed: int, only: Collection[str] | None = None) -> tuple[list[Trial], Floats]:
-        """The draws as the simulator takes them: trials (one for each draw, with its pressures), model parameters.
-        Shape (count, n_parameters).
-        """
+        """The draws as the simulator takes them: a trial each with its pressures; parameters, (count, n_parameters)."""
         draws = self.draw(count, seed, only)
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
         pairs = zip(draws[PRESSURE].tolist(), draws[YIELD].tolist(), strict=True)

@@ -357,9 +357,7 @@ def beyond_adequate(rms_m: Iterable[float], high_m: Iterable[float], refuted: bo
 
 
 def model_errors(table: pd.DataFrame, refuted: bool = False) -> str:
-    """The position error of the model in two sentences, from `comparison.csv` with the numbers of trials; blank without
-    a condition.
-    """
+    """The position error of the model in two sentences, from `comparison.csv` with numbers of trials; or blank."""
     if not len(table):
         return ""
     worst = table.sort_values("rms_position_m").iloc[-1]

@@ -140,9 +140,7 @@ def position_to_px(track: pd.DataFrame) -> Any:
 
 
 def write_recording(folder: Path, measured: Measurement, scaled: bool) -> dict[str, Path]:
-    """Write the edge of every frame along the axis and in the picture, with errors, and in metres if there is a scale;
-    the strip; and the clip.
-    """
+    """Write the edge of every frame along the axis and in the picture, in metres if scaled; the strip; and the clip."""
     import pandas as pd
 
     tracking, recording, m_per_px = measured.tracking, measured.recording, measured.m_per_px
