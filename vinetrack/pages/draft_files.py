@@ -15,18 +15,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CONTAINERS, IMAGES, Correction
-from vinetrack.core.tables import (
-    PROVENANCE,
-    Table,
-    parse_yaml,
-    read_table,
-    read_text,
-    read_yaml,
-    write_bytes,
-    write_text,
-)
 from vinetrack.core.units import UNITS, convert, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and_unit
@@ -68,15 +59,15 @@ def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
 # Editing of the trial sheet: cells as text, with those of an existing sheet preserved.
 
 
-def read_sheet(folder: Path) -> Table:
+def read_sheet(folder: Path) -> tables.Table:
     """Read the sheet of a folder; without rows if there is none."""
     path = folder / SHEET
     if not path.exists():
         # The names, and what differs between trials in most campaigns
         columns = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
-        return Table(columns, (), (), (), ",", ".")
+        return tables.Table(columns, (), (), (), ",", ".")
     try:
-        table = read_table(path)
+        table = tables.read_table(path)
     except InputError as error:
         raise ExperimentError([Problem.from_error(error, SHEET)]) from None
     loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
@@ -91,12 +82,12 @@ def _refusal(message: str, file: str, remedy: str, **more: Any) -> ExperimentErr
     return ExperimentError([Problem(message=message, file=file, remedy=remedy, **more)])
 
 
-def cells_of(sheet: Table) -> list[list[str]]:
+def cells_of(sheet: tables.Table) -> list[list[str]]:
     """The header and the cells of a sheet."""
     return [list(sheet.columns), *([row.get(column, "") for column in sheet.columns] for row in sheet.rows)]
 
 
-def with_recordings(sheet: Table, recordings: Sequence[str], shared: Mapping[str, object]) -> Table:
+def with_recordings(sheet: tables.Table, recordings: Sequence[str], shared: Mapping[str, object]) -> tables.Table:
     """Return the sheet with a row added for each recording, or track, that has none, filled in from their names."""
     named = {_path(row.get(column, "")) for row in sheet.rows for column in ("video", "track")}
     new = [recording for recording in recordings if _path(recording) not in named]
@@ -137,8 +128,8 @@ def read_settings_text(folder: Path) -> str:
     if not path.exists():
         read_experiment_settings(path)  # refuses one under another name
         return first_settings()
-    read_yaml(path)  # refuses what cannot be edited
-    return read_text(path)
+    tables.read_yaml(path)  # refuses what cannot be edited
+    return tables.read_text(path)
 
 
 def first_settings() -> str:
@@ -166,7 +157,7 @@ axis:
 def shared_values(text: str) -> dict[str, Any]:
     """Return the columns that the settings set for all trials, under the names (and units) used there."""
     quantities = set(map(quantity, SHARED))
-    content = parse_yaml(text, SETTINGS).content
+    content = tables.parse_yaml(text, SETTINGS).content
     return {key: value for key, value in content.items() if value is not None and quantity(str(key)) in quantities}
 
 
@@ -174,7 +165,7 @@ def with_shared(text: str, values: Mapping[str, str]) -> str:
     """Return the settings with columns set or cleared for all trials; other keys and all comments are kept. A key of
     the same quantity in another unit is renamed, or goes, since it would be refused even if it were blank.
     """
-    content = parse_yaml(text, SETTINGS).content
+    content = tables.parse_yaml(text, SETTINGS).content
     for key, cell in values.items():
         for other in [name for name in map(str, content) if name != key and quantity(name) == quantity(key)]:
             if split_unit(other)[1]:
@@ -195,7 +186,7 @@ def _value(cell: str) -> Any:
     if not cell:
         return None
     try:
-        read = parse_yaml(f"v: {cell}\n", SETTINGS).content["v"]
+        read = tables.parse_yaml(f"v: {cell}\n", SETTINGS).content["v"]
     except ExperimentError:
         return cell
     return read if isinstance(read, int | float | bool | str) else cell
@@ -211,7 +202,7 @@ FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
 class Draft:
     """A sheet, settings and corrections not yet written; `stamp` is the fingerprint of the files that were read."""
 
-    sheet: Table
+    sheet: tables.Table
     settings: str
     stamp: str
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
@@ -263,7 +254,7 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
     }
     written = [name for name in FILES if changed[name]]
     for name in written:
-        write_text(folder / name, texts[name])
+        tables.write_text(folder / name, texts[name])
     return written
 
 
@@ -277,7 +268,7 @@ def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
             if path.name not in FILES:
                 (copy / path.name).symlink_to(os.path.realpath(path), target_is_directory=path.is_dir())
         for name, text in draft.texts().items():
-            write_text(copy / name, text)
+            tables.write_text(copy / name, text)
         yield copy
 
 
@@ -472,9 +463,9 @@ NOTES = (".txt", ".md", ".tsv", ".csv")  # and of notes on the recordings
 
 def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
     """Return files with these endings, such as pressure traces, as paths relative to the folder."""
-    folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
-    tables = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
-    names = (path.relative_to(folder).as_posix() for path in tables)
+    folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / tables.PROVENANCE).exists())]
+    found = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
+    names = (path.relative_to(folder).as_posix() for path in found)
     return sorted((name for name in names if name not in FILES), key=natural_order)
 
 
@@ -559,14 +550,14 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     """Set `model:` in `experiment.yaml`, byte-order mark and line ends kept, and extend `effects:`; return the path."""
     path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
     before = path.read_bytes() if path.exists() else b""
-    text = read_text(path) if before else ""
+    text = tables.read_text(path) if before else ""
     listed = list(read_experiment_settings(path).effects)
     if new := [name for name in files if name not in listed]:
         text = with_value(text, "effects", [*listed, *new], path.name)
     text = with_value(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")
-    write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
+    tables.write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
     return path
 
 
@@ -575,7 +566,7 @@ def with_value(text: str, key: str, value: Any, file: str = SETTINGS) -> str:
     from ruamel.yaml import YAML
     from ruamel.yaml.util import load_yaml_guess_indent
 
-    before, value = parse_yaml(text, file).content, json.loads(json.dumps(value))
+    before, value = tables.parse_yaml(text, file).content, json.loads(json.dumps(value))
     if key in before and before[key] == value:
         return text
     document, out = YAML(), io.StringIO()
@@ -593,7 +584,7 @@ def with_value(text: str, key: str, value: Any, file: str = SETTINGS) -> str:
         document.dump({key: _edited(None, value)}, out)
         changed = text + ("\n" if text and not text.endswith("\n") else "") + out.getvalue()
     with suppress(ExperimentError):
-        if parse_yaml(changed, file).content == {**before, key: value}:
+        if tables.parse_yaml(changed, file).content == {**before, key: value}:
             return changed
     message, remedy = "cannot be changed without altering other settings", f"set it by hand: {key}: {value}"
     raise ExperimentError([Problem(message=message, file=file, column=key, remedy=remedy)])

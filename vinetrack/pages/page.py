@@ -27,6 +27,7 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.narrative.verdict_text import Row, quantity_text, spaced_name, verdict_table
+from vinetrack.pages import plots
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -44,18 +45,6 @@ from vinetrack.pages.campaign import (
 )
 from vinetrack.pages.draft_files import save_model
 from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
-from vinetrack.pages.plots import (
-    FilmPanel,
-    Plots,
-    beside,
-    button,
-    panel,
-    progress_bar,
-    set_text,
-    templates,
-    theme,
-    vine_colours,
-)
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
@@ -71,11 +60,11 @@ def _in_mm(value_m: float) -> str:
 def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequence[tuple[str, str, str]]) -> str:
     """Return two models compared, the last fit of this page as it is printed, and all its fits."""
     if not fits:
-        return panel("numbers", compared=compared)
+        return plots.panel("numbers", compared=compared)
     before, fit = fits[max(len(fits) - 2, 0)].fit, fits[-1].fit
     gain, more = 2 * (fit.log_likelihood - before.log_likelihood), len(fit.numbers) - len(before.numbers)
     ladder = [(model_text(each.choice.effects), _in_mm(each.prediction.rms_m)) for each in fits]
-    return panel(
+    return plots.panel(
         "numbers",
         compared=compared,
         rows=[number_row(number) for number in fit.numbers],
@@ -207,9 +196,11 @@ class TrialSelector:
         given = {"name": "conditions", "css_classes": ["chips"], "margin": (2, 0)}
         self._conditions = bk.CheckboxButtonGroup(labels=labels, active=self._every, **given)
         self._conditions.on_change("active", lambda _attr, _old, _new: on_change())
-        tools = beside(
-            button("all", "choose_all", lambda: self._conditions.update(active=self._every), css_classes=["small"]),
-            button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
+        tools = plots.beside(
+            plots.button(
+                "all", "choose_all", lambda: self._conditions.update(active=self._every), css_classes=["small"]
+            ),
+            plots.button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
             css=":host { gap: 4px; }",
         )
         self.root = bk.Column(self._conditions, tools, name="choose")
@@ -273,15 +264,15 @@ class Page:
         self.headline, self.status = bk.Div(name="headline"), bk.Div(name="status")
         self.numbers, self.verdict, self.next = bk.Div(name="numbers"), bk.Div(name="verdict"), bk.Div(name="next")
         self.selector = TrialSelector(campaign, self._selection_changed)
-        self.plots = Plots(campaign, self.selector.toggle)
+        self.plots = plots.Plots(campaign, self.selector.toggle)
         self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
-        self.film = FilmPanel(campaign, self.document, self.plots.set_instant)
+        self.film = plots.FilmPanel(campaign, self.document, self.plots.set_instant)
         self.saved = bk.Div(name="saved")
-        save = beside(button("Save the model to experiment.yaml", "save", self._save))
-        self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
-        back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
-        self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
-        buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
+        save = plots.beside(plots.button("Save the model to experiment.yaml", "save", self._save))
+        self.refit = plots.button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
+        back = plots.button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
+        self.hold = plots.button("Hold to compare", "hold", self._hold, margin=5, width=132)
+        buttons = plots.beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
         actions = bk.Column(buttons, name="actions")
         texts = [self.headline, self.status, self.numbers, self.verdict, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
@@ -292,14 +283,14 @@ class Page:
         shown = {"plots": figures, "film": self.film.figure}
         self.document.js_on_event("document_ready", bk.CustomJS(args=shown, code=script))
         self.document.title = f"{campaign.folder.name} – vinetrack explorer"
-        self.document.theme = theme()
-        self.document.template = templates().get_template("page.html")
+        self.document.theme = plots.theme()
+        self.document.template = plots.templates().get_template("page.html")
         left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
         on_screen = {colour: f"var({token})" for colour, token in TOKENS.items()}
         self.document.template_variables.update(
             name=campaign.folder.name,
             style=Markup(page_frame() + style),
-            vines=[(vine, on_screen.get(colour.lower(), colour)) for vine, colour in vine_colours(campaign)],
+            vines=[(vine, on_screen.get(colour.lower(), colour)) for vine, colour in plots.vine_colours(campaign)],
             tally=f"{len(campaign.trials)} trials, {len(campaign.conditions)} conditions{left_out}",
         )
 
@@ -459,21 +450,21 @@ class Page:
         """Update all text of the page."""
         if self._job is None:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
-            set_text(self.headline, self._headline())
+            plots.set_text(self.headline, self._headline())
         compared = []
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference)
             if self.held is not None:
                 held, now = self.held[1], self._described(self.shown)
                 compared = [(title, held.get(title, "–"), now.get(title, "–")) for title in held | now]
-        set_text(self.numbers, numbers_panel(self.fits, self._sizes_changed, compared))
+        plots.set_text(self.numbers, numbers_panel(self.fits, self._sizes_changed, compared))
         diagnosis, rows, advice = self.diagnosis, list[Row](), None
         if diagnosis is not None:
             rows = verdict_table(diagnosis)
             advice = next_experiment(diagnosis.next_experiment)
         command = shlex.join(["vinetrack", "diagnose", self.campaign.folder.as_posix()])
-        set_text(self.verdict, panel("verdict", diagnosis=diagnosis, diagnose=command, rows=rows))
-        set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
+        plots.set_text(self.verdict, plots.panel("verdict", diagnosis=diagnosis, diagnose=command, rows=rows))
+        plots.set_text(self.next, plots.panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
 
     def _headline(self) -> str:
         """The error of the model now and as the page opened, beside that of an adequate model, as a heading."""
@@ -481,7 +472,7 @@ class Page:
         errors_m, words = {} if shown is None else shown.errors_m, model_text(effects)
         highest_m = [campaign.highest_m.get(name, math.nan) for name in errors_m]
         now, before = ("" if one is None else _in_mm(one.rms_m) for one in (shown, self.background.prediction))
-        return panel(
+        return plots.panel(
             "headline",
             model=words[:1].upper() + words[1:],
             now=now,
@@ -502,13 +493,13 @@ class Page:
             task, step = ("fitting the model in use first", background.step) if waits else ("refitting", self._step)
             done, since_s = 0 if step is None else step.iteration, time.monotonic() - self._begun_s
             # 5: steps after which the bar is half full; how many there will be is not known (chosen)
-            text = progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
+            text = plots.progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
         elif failure := self._message or background.failure:
             text = f'<span class="bad">{escape(failure)}</span>'
         elif background.running:
             fitting = "fitting the model in use, in the background"
             text = f"<small>{'preparing the model' if background.prediction is None else fitting} …</small>"
-        set_text(self.status, text)
+        plots.set_text(self.status, text)
 
     # ---- saving --------------------------------------------------------------------------------------------------
 
@@ -521,7 +512,7 @@ class Page:
             self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return
         rerun = command_for_results(folder, self.campaign.folder)
-        self.saved.text = panel("saved", path=path.as_posix(), model=model_text(effects), rerun=rerun)
+        self.saved.text = plots.panel("saved", path=path.as_posix(), model=model_text(effects), rerun=rerun)
 
     def close(self) -> None:
         """The page was closed."""

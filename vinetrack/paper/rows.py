@@ -22,16 +22,7 @@ from vinetrack.core.records import Trial
 from vinetrack.core.units import GRAVITY_M_S2, convert, or_nan
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.damping import regress
-from vinetrack.paper import published
-from vinetrack.paper.motions import (
-    DEPARTURES,
-    area_m2,
-    comparison_tables,
-    drag_shares,
-    rule_on_noise_free,
-    speeds_at,
-    volume_change,
-)
+from vinetrack.paper import motions, published
 from vinetrack.paper.published import SOURCE
 from vinetrack.planning.prediction import gauge_left
 from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
@@ -169,7 +160,7 @@ def paper_tables(
     steady: pd.DataFrame, **files: Any,
 ) -> dict[str, pd.DataFrame]:  # fmt: skip
     """Return the tables of the paper's figures, and `paper` with every number; `kinematics` reads those of a trial."""
-    tables = comparison_tables(trials, fit, kinematics)
+    tables = motions.comparison_tables(trials, fit, kinematics)
     files |= {name: tables[f"paper_{name}"] for name in ("positions", "speeds", "departures")}
     of_results = result_rows(mark, fit, **files)
     rows = [*protocol_rows(trials, steady, mark), *of_results, *computed_rows(), *theory_rows(trials)]
@@ -266,7 +257,7 @@ def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -
     size = {row.departure: factor * float(getattr(row, column)) for row in lines.itertuples()}
     if not size:
         return ""
-    slow, fast, slack, both_slow, both_fast = (size[departure.name] for departure in DEPARTURES)
+    slow, fast, slack, both_slow, both_fast = (size[departure.name] for departure in motions.DEPARTURES)
     return (
         f"not in it: a chamber that nothing refills would cause {slow:.2f} to {fast:.2f} {unit}, a tail that "
         f"cannot push {slack:.2f}, both {both_slow:.2f} to {both_fast:.2f}"
@@ -354,7 +345,7 @@ def p_value(R2: float, n: int) -> float:
 
 def weight_over_gas(diameter_mm: float) -> float:
     """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
-    gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * area_m2(diameter_mm)
+    gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * motions.area_m2(diameter_mm)
     return published.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
 
 
@@ -364,7 +355,7 @@ def computed_rows() -> Iterator[Row]:
     for R in published.DAMPING_B:
         relative = walls_um[R] / diameters_mm[R] / (walls_um[1] / diameters_mm[1])
         yield row_of("isometry_R{R}", relative, published_as=1.0, R=R)
-    change = volume_change(published.CHAMBER_L / 1e3, max(diameters_mm.values()), published.LONGEST_VINE_MM)
+    change = motions.volume_change(published.CHAMBER_L / 1e3, max(diameters_mm.values()), published.LONGEST_VINE_MM)
     printed_change, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
     yield row_of("chamber_volume_change", 100 * change, published_as=printed_change)
     for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
@@ -382,15 +373,15 @@ def computed_rows() -> Iterator[Row]:
     gauge_Pa, yield_Pa = 1e3 * published.STEADY_SPEED_KPA, 1e3 * published.YIELD_PRESSURE_KPA
     for R, printed in published.DAMPING_B.items():
         # By Eq. (3)
-        forces_N = [(gauge_Pa - least_Pa) * area_m2(diameters_mm[R]) for least_Pa in (0.0, yield_Pa)]
+        forces_N = [(gauge_Pa - least_Pa) * motions.area_m2(diameters_mm[R]) for least_Pa in (0.0, yield_Pa)]
         bare, with_yield = ((force_N / printed) ** (1 / published.EXPONENT) for force_N in forces_N)
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
     vine, (length_mm, diameter_mm) = published.INJECTOR, published.INJECTOR_CHAMBER_MM
     injected = 100 * 0.017  # Relative change of its pressure
-    chamber_m3 = area_m2(diameter_mm) * length_mm / 1e3
-    change = volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
+    chamber_m3 = motions.area_m2(diameter_mm) * length_mm / 1e3
+    change = motions.volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
     slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
     yield row_of("injector_volume_change", 100 * change, published_as=injected)
     yield row_of("injector_gauge_drop", slow, published_as=injected, fast=fast)
@@ -418,11 +409,11 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     fast_at = (0.90, 0.95, 0.98, 0.99)
     fast = published.FAST_VINE
     B = damping_prior(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
-    for fraction, speed in zip(fast_at, speeds_at(fast_at, fast), strict=True):
+    for fraction, speed in zip(fast_at, motions.speeds_at(fast_at, fast), strict=True):
         # 56: the speed of its leading edge, m/s, that the authors predict
         yield row_of("fast_vine_predicted_{percent:.0f}", speed, published_as=56.0, percent=100 * fraction, B=B)
     # (0.50, 0.95, 0.99): fractions of the length at which drag is evaluated (chosen)
-    for fraction, share, by_print in drag_shares((0.50, 0.95, 0.99)):
+    for fraction, share, by_print in motions.drag_shares((0.50, 0.95, 0.99)):
         facts: Row = {"percent": 100 * fraction, "by_print": 100 * by_print}
         # 5 %: the largest part of the drive that drag is stated to be
         yield row_of("drag_share_{percent:.0f}", 100 * share, published_as=5.0, **facts)
@@ -436,7 +427,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
         return
     cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
     for row, gamma in cases.items():
-        n, found = rule_on_noise_free(gamma, list(chosen.values()))
+        n, found = motions.rule_on_noise_free(gamma, list(chosen.values()))
         scales = sorted(found)
         facts = {"B": ", ".join(f"{found[R]:.2f}" for R in scales), "scales": ", ".join(map(str, scales))}
         yield row_of(row, n, published_as=published.EXPONENT, n=len(chosen), **facts)

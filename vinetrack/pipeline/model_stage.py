@@ -45,15 +45,7 @@ from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    measured_trials,
-    read_diagnosis,
-    read_json,
-    read_result,
-    table_of,
-)
+from vinetrack.results import folder_layout as layout
 from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
 
 if TYPE_CHECKING:
@@ -67,7 +59,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
     """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks. A
     diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
     """
-    lines, results = fit_damping(job), Results(job.results)
+    lines, results = fit_damping(job), layout.Results(job.results)
     job.say("fitting the model")
     fitted, pairs, motions = fit_model(job)
     try:
@@ -84,9 +76,9 @@ def fit_and_diagnose(job: Job) -> list[str]:
 
 def fit_model(job: Job) -> tuple[Fit | None, Pairs, list[TrialMotion]]:
     """Fit the model in use, write the fit and what it is compared with; return it, its trials and their motions."""
-    experiment, results = job.experiment, Results(job.results)
-    damping = read_json(results.damping)
-    pairs = measured_trials(experiment, results)
+    experiment, results = job.experiment, layout.Results(job.results)
+    damping = layout.read_json(results.damping)
+    pairs = layout.measured_trials(experiment, results)
     seen = look_at_motions(pairs, job.settings)
     kinematics = {motion.trial.name: motion.kinematics for motion in seen}
     initial: Fit | None = None
@@ -98,7 +90,7 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs, list[TrialMotion]]:
         fit = initial_fit(model, pairs, candidates, free=free)
         initial = None if free else fit
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
-        check, messages = table_of(CHECK_COLUMNS), list[str]()
+        check, messages = layout.table_of(CHECK_COLUMNS), list[str]()
         try:
             check = check_damping(fit, damping["log_log" if damping["both_axes"].get("refused") else "both_axes"])
         except FitError as error:
@@ -115,7 +107,7 @@ def fit_model(job: Job) -> tuple[Fit | None, Pairs, list[TrialMotion]]:
         trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
-        trajectories, tables = {}, [*map(table_of, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS))]
+        trajectories, tables = {}, [*map(layout.table_of, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS))]
     for path, table in zip((results.comparison, results.model_check, results.audit), tables, strict=True):
         write_csv(path, table)
     _emptied(results.folder / "comparison")
@@ -148,7 +140,7 @@ Report = Callable[[str], None]
 
 
 def diagnosed(
-    experiment: Experiment, results: Results, pairs: Pairs, report: Report, fitted: Fit | None = None
+    experiment: Experiment, results: layout.Results, pairs: Pairs, report: Report, fitted: Fit | None = None
 ) -> Diagnosis:
     """The diagnosis of these trials as the experiment asks for it, with what contradicts its sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
@@ -157,7 +149,7 @@ def diagnosed(
     return with_contradictions(diagnose(experiment, tracks=tracks, report=report, fitted=fitted), results, pairs)
 
 
-def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) -> Diagnosis:
+def with_contradictions(diagnosis: Diagnosis, results: layout.Results, pairs: Pairs) -> Diagnosis:
     """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics."""
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
@@ -168,10 +160,10 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
     return replace(contradicted, explanation=verdict_sentence(contradicted))
 
 
-def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
+def sheet_contradictions(results: layout.Results, pairs: Pairs) -> dict[str, str]:
     """Return a sentence for each column of the sheet that recordings or speeds contradict, by its name."""
     noted: dict[str, list[str]] = {}
-    content = {trial: read_json(results.analysed(trial.name)) for trial, _ in pairs}
+    content = {trial: layout.read_json(results.analysed(trial.name)) for trial, _ in pairs}
     found = [(trial, entry) for trial, seen in content.items() for entry in seen.get("contradictions", [])]
     sure = confirmed([(trial.vine, entry["column"]) for trial, entry in found], [trial.vine for trial in content])
     for trial, entry in found:
@@ -187,11 +179,11 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 
 
 def write_diagnosis(
-    results: Results, diagnosis: Diagnosis, motions: Callable[[], list[TrialMotion]], settings: RunSettings
+    results: layout.Results, diagnosis: Diagnosis, motions: Callable[[], list[TrialMotion]], settings: RunSettings
 ) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; `motions` are needed if a model was extended."""
-    ladder = table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
-    tables = {"damping_laws.csv": table_of(LAW_COLUMNS), "steps.csv": all_steps(results, ladder)}
+    ladder = layout.table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
+    tables = {"damping_laws.csv": layout.table_of(LAW_COLUMNS), "steps.csv": all_steps(results, ladder)}
     tables |= diagnosis_tables(diagnosis)
     folder = _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
@@ -201,7 +193,7 @@ def write_diagnosis(
                 laws["+".join(fit.model.names)] = redo_damping(fit.model, of_trials, settings)
             except ValueError as error:
                 log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
-        tables["damping_laws.csv"] = law_table(laws) if laws else table_of(LAW_COLUMNS)
+        tables["damping_laws.csv"] = law_table(laws) if laws else layout.table_of(LAW_COLUMNS)
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
@@ -213,13 +205,15 @@ def write_diagnosis(
     write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
 
 
-def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
+def all_steps(results: layout.Results, ladder: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
     if its error there is the same, so that it is of the same trials.
     """
     import pandas as pd
 
-    former = next((read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0])
+    former = next(
+        (layout.read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0]
+    )
     known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
     for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
         if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
@@ -267,16 +261,16 @@ def _followed(fit: Fit) -> Sequence[TrialFit]:
 
 def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
     """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
-    results = Results(folder)
-    diagnosis = read_diagnosis(results)
+    results = layout.Results(folder)
+    diagnosis = layout.read_diagnosis(results)
     if diagnosis is None:
-        raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
+        raise layout.ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
     if diagnosis.contradicted_columns or not diagnosis.verdict:
-        raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
+        raise layout.ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
-        raise ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
+        raise layout.ResultsError(str(remark("no_law_needed", folder=folder, verdict=diagnosis.verdict)))
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.added]), experiment.user_effects)
-    proposal = propose(model, diagnosis.settled(measured_trials(experiment, results)), report)
+    proposal = propose(model, diagnosis.settled(layout.measured_trials(experiment, results)), report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     facts = {"count": len(proposal.before.trials), "experiment": experiment.name, "model": model.names}
@@ -290,7 +284,7 @@ def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tupl
         origin = remark("table_origin", **facts, rms_m=table.rms_left_out_m)
         files[experiment.folder / table.effect.path.name] = table.text(str(origin))
     if there := [path for path in files if path.exists()]:
-        raise ResultsError(f"{there[0]} exists already: move it away.")
+        raise layout.ResultsError(f"{there[0]} exists already: move it away.")
     for path, text in files.items():
         write_text(path, text)
         remember(path)

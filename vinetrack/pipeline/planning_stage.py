@@ -59,15 +59,7 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
     read_sizes,
 )
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    measured_trials,
-    read_diagnosis,
-    read_fit,
-    read_json,
-    read_source_experiment,
-)
+from vinetrack.results import folder_layout as layout
 
 # ------------------------------------------------------------------------------
 # Inputs of the commands: options or a sheet, a fit, effects.
@@ -77,20 +69,20 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
     """Choose the fit of a results folder to predict from: of the model that the diagnosis ended with as `adequate`,
     after any other verdict only `anyway`. Returns it, and the heading over all that is predicted from it.
     """
-    results = Results(folder)
-    in_use, diagnosis = read_fit(results), read_diagnosis(results)
+    results = layout.Results(folder)
+    in_use, diagnosis = layout.read_fit(results), layout.read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",)
     if diagnosis.verdict == ADEQUATE:
         return in_use, ()
-    final = FitSummary.from_json(read_json(results.final_fit)) if results.final_fit.exists() else None
+    final = FitSummary.from_json(layout.read_json(results.final_fit)) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
         return final, (str(remark("from_final_model", added=added)),)
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
         reason = "because the diagnosis refuted the model, and no fit of one that describes the trials is there"
-        raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
+        raise layout.ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
     caution = remark("from_refuted_model", model=f"the model with {added} added" if final else "the model in use")
     return final or in_use, (f"! {verdict}", f"! {caution}")
 
@@ -123,7 +115,9 @@ def read_basis(
         summary, heading = choose_fit(results, anyway)
         fit = FitNumbers(summary, results.as_posix())
     if sheet is not None and (sheet / PROVENANCE).exists():
-        raise ResultsError(f"{sheet} holds results: predict from their fit with --fit {sheet}, and the vine by options")
+        raise layout.ResultsError(
+            f"{sheet} holds results: predict from their fit with --fit {sheet}, and the vine by options"
+        )
     if sheet is None:
         planned = planned_trial(cells, needed=needed)
     else:
@@ -133,7 +127,7 @@ def read_basis(
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
     user_effects = planned.user_effects
     if fit is not None and not set(fit.fit.names) <= set(catalogue()):
-        folder = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
+        folder = Path(str(layout.read_json(layout.Results(Path(fit.source)).provenance).get("experiment", "")))
         settings = read_experiment_settings(folder / "experiment.yaml")
         user_effects = replace(planned, folder=folder, settings=settings).user_effects
     read = [read_sizes(text, user_effects) for text in effects]
@@ -437,8 +431,8 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
     target, added = request.target, tuple[str, ...]()
     experiment: Experiment | None = None
     if (target / PROVENANCE).exists():
-        results, experiment = Results(target), read_source_experiment(target, request.experiment)
-        diagnosis, pairs = read_diagnosis(results), measured_trials(experiment, results)
+        results, experiment = layout.Results(target), layout.read_source_experiment(target, request.experiment)
+        diagnosis, pairs = layout.read_diagnosis(results), layout.measured_trials(experiment, results)
         if diagnosis is not None and diagnosis.final_verdict == ADEQUATE:
             added, pairs = diagnosis.added, diagnosis.settled(pairs)
     else:

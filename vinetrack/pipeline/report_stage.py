@@ -29,15 +29,7 @@ from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import build_report, report_content, tally
 from vinetrack.report.clips import recording_facts, write_overlay, write_recording
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    describe_run,
-    read_fit,
-    read_json,
-    read_result,
-    read_source_experiment,
-)
+from vinetrack.results import folder_layout as layout
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.survey import measure_recording
 
@@ -49,10 +41,10 @@ def write_report(job: Job) -> list[str]:
     lines = compare_with_paper(job) if job.experiment.settings.published else []
     lines += [*draw_overlays(job), *draw_figures(job)]
     job.say("writing the report")
-    experiment, results = job.experiment, Results(job.results)
+    experiment, results = job.experiment, layout.Results(job.results)
     settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
     inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
-    provenance = describe_run(experiment.folder, inputs, settings, experiment.settings.model)
+    provenance = layout.describe_run(experiment.folder, inputs, settings, experiment.settings.model)
     page = build_report(report_content(experiment, job.results, provenance))
     write_json(results.provenance, provenance)
     write_text(results.report, page)
@@ -65,7 +57,7 @@ def write_report(job: Job) -> list[str]:
 
 def draw_overlays(job: Job) -> list[str]:
     """Write the clips that the settings request, and again those that there are; a line for each that could not be."""
-    experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
+    experiment, results, settings = job.experiment, layout.Results(job.results), job.settings.overlays
     chosen = chosen_trials(experiment, results, settings.of)
     for path in results.overlays.glob("*.mp4"):  # of a trial that is not tracked any more
         if path.stem not in chosen:
@@ -80,21 +72,21 @@ def draw_overlays(job: Job) -> list[str]:
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
-    results, read = Results(folder), read_source_experiment(folder, experiment)
+    results, read = layout.Results(folder), layout.read_source_experiment(folder, experiment)
     filmed = [one.name for one in read.trials if one.video is not None]
     if trial not in filmed:
         existing = ", ".join(filmed[:6]) + ", …" * (len(filmed) > 6) or "none"
-        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: there are {existing}")
-    of_run = read_json(results.provenance).get("settings") or {}
+        raise layout.ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: there are {existing}")
+    of_run = layout.read_json(results.provenance).get("settings") or {}
     asked = {"seconds": seconds} if math.isfinite(seconds) else {}
     return write_overlay(read.trial(trial), results, OverlaySettings(**(of_run.get("overlays") or {}) | asked))
 
 
-def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
+def chosen_trials(experiment: Experiment, results: layout.Results, of: str) -> list[str]:
     """Return the names of the trials to draw: the first tracked recording of every condition, all, or none; and those
     whose clip is there already, which would show another model otherwise.
     """
-    trials = read_result(results.trials)
+    trials = layout.read_result(results.trials)
     tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
     filmed = {trial.name: trial.condition for trial in experiment.trials if trial.video and trial.name in tracked}
     first = {condition: name for name, condition in reversed(filmed.items())}
@@ -102,13 +94,13 @@ def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str
     return [name for name in filmed if name in wanted[of] or results.overlay(name).exists()]
 
 
-def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:
+def _try_overlay(trial: Trial, results: layout.Results, settings: OverlaySettings) -> str:
     """Write the clip of one trial; return why it could not be made, or blank."""
     try:
         write_overlay(trial, results, settings)
     except Exception as error:
         log.exception("%s: no clip", trial.name)
-        return f"{trial.name}: no clip: {error if isinstance(error, ResultsError) else INTERNAL_ERROR}"
+        return f"{trial.name}: no clip: {error if isinstance(error, layout.ResultsError) else INTERNAL_ERROR}"
     return ""
 
 
@@ -145,16 +137,16 @@ def _drawn(names: Sequence[str], folder: Path, trials: tuple[Trial, ...], settin
 
 def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables of the figures of the paper."""
-    experiment, results = job.experiment, Results(job.results)
+    experiment, results = job.experiment, layout.Results(job.results)
     tables = paper.paper_tables(
         experiment.trials,
         paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED,
-        read_fit(results),
-        lambda name: read_result(results.kinematics(name)),
-        read_result(results.steady),
-        damping=read_json(results.damping),
-        scaling=read_json(results.scaling),
-        conditions=read_result(results.conditions),
+        layout.read_fit(results),
+        lambda name: layout.read_result(results.kinematics(name)),
+        layout.read_result(results.steady),
+        damping=layout.read_json(results.damping),
+        scaling=layout.read_json(results.scaling),
+        conditions=layout.read_result(results.conditions),
     )
     for name, content in tables.items():
         write_csv(results.folder / f"{name}.csv", content)

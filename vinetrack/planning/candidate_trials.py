@@ -24,14 +24,7 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
 from vinetrack.inference.marginal_likelihood import FitState, MixedProblem
 from vinetrack.inference.optimiser import Solution, make_problem
-from vinetrack.inference.sensitivity import (
-    N_TRIAL_EFFECTS,
-    ORIGIN,
-    RELEASE,
-    Jobs,
-    Predictor,
-    initial_trial_effects,
-)
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Jobs, Predictor, initial_trial_effects
 from vinetrack.inference.solving import trial_fit
 from vinetrack.planning.predictive_inputs import damping_prior, hoop_stress_Pa
 from vinetrack.tracks.position_noise import ar1_noise
