@@ -30,7 +30,9 @@ from vinetrack.core.problems import ExperimentError, InputError, UserError, form
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, safe_join, write_csv, write_json, write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.experiment.schema import COLUMNS, Column, option
+from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES, Job, Kept, Stage, code_hash, compilation_told, identity
+from vinetrack.results import folder_layout as layout
 
 if TYPE_CHECKING:
     from vinetrack.effects import Effect
@@ -250,9 +252,7 @@ def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
 @command()
 def _check(experiment: Path) -> Answer:
     """Check sheet, settings, effects, tracks and recordings in seconds; list facts about each recording."""
-    from vinetrack.pipeline.workflow import check_folder, find_experiment
-
-    checked = check_folder(find_experiment(experiment))
+    checked = workflow.check_folder(workflow.find_experiment(experiment))
     is_sound = all(problem.severity == "note" for problem in checked.problems)
     lines = [*checked.lines(), *[f"{experiment}: no problems found."] * is_sound]
     return lines, checked.to_json(), checked.failed
@@ -261,16 +261,13 @@ def _check(experiment: Path) -> Answer:
 @command()
 def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say) -> Answer:
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.pipeline.workflow import check_before_run, run_chain, run_paths
-    from vinetrack.results.folder_layout import Results, read_json
-
-    paths = run_paths(folder, results)
+    paths = workflow.run_paths(folder, results)
     with compilation_told(say):
-        check_before_run(*paths, say)
-    run_chain(*paths, cores, say, verbose)
-    to = Results(paths[1])
+        workflow.check_before_run(*paths, say)
+    workflow.run_chain(*paths, cores, say, verbose)
+    to = layout.Results(paths[1])
     lines, failed = _run_lines(to.folder)
-    return lines, {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}, failed
+    return lines, {"results": to.folder, "report": to.report, "diagnosis": layout.read_json(to.diagnosis)}, failed
 
 
 def _run_lines(folder: Path) -> tuple[list[str], bool]:
@@ -278,15 +275,13 @@ def _run_lines(folder: Path) -> tuple[list[str], bool]:
     or why there is none and what to do; and whether most trials failed or there is no verdict. They are kept, since
     reading a diagnosis takes most of a second.
     """
-    from vinetrack.results.folder_layout import Results, read_diagnosis, read_result
-
-    results = Results(folder)
+    results = layout.Results(folder)
 
     def summary() -> tuple[list[str], bool]:
         from vinetrack.narrative.diagnosis_text import failures_told, table_lines
         from vinetrack.narrative.verdict_text import verdict_line, verdict_table
 
-        trials, diagnosis = read_result(results.trials), read_diagnosis(results)
+        trials, diagnosis = layout.read_result(results.trials), layout.read_diagnosis(results)
         told, failed = failures_told(trials)
         lines = [f"Report: {results.report}"] if failed or not told else [told, f"Report: {results.report}"]
         if diagnosis is not None and diagnosis.verdict:
@@ -325,19 +320,17 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.experiment.settings import run_settings
     from vinetrack.kinematics.summary import look_at_motions
     from vinetrack.pipeline.model_stage import diagnosed, write_diagnosis
-    from vinetrack.pipeline.workflow import find_experiment
-    from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_source_experiment
 
-    results = Results(target)
+    results = layout.Results(target)
     if results.provenance.exists():
-        source = read_source_experiment(target, experiment)
-        pairs = measured_trials(source, results)
+        source = layout.read_source_experiment(target, experiment)
+        pairs = layout.measured_trials(source, results)
         diagnosis = diagnosed(source, results, pairs, report)
         if json is None:
-            settings = run_settings(read_json(results.provenance)["settings"])
+            settings = run_settings(layout.read_json(results.provenance)["settings"])
             write_diagnosis(results, diagnosis, partial(look_at_motions, pairs, settings), settings)
         return [str(diagnosis).replace("RESULTS", str(target))], diagnosis.to_json()
-    read = read_experiment(find_experiment(target))
+    read = read_experiment(workflow.find_experiment(target))
     if read.trials and all(trial.track is None for trial in read.trials):
         raise UserError(
             f"{target}: its trials are recordings, which must be tracked first: vinetrack run {target} tracks and "
@@ -353,23 +346,21 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
     from vinetrack.diagnosis.propose import add
     from vinetrack.narrative.diagnosis_text import added_in_words
     from vinetrack.pages.draft_files import save_model
-    from vinetrack.pipeline.workflow import command_for_results
-    from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
 
-    read = read_source_experiment(results, experiment)
+    read = layout.read_source_experiment(results, experiment)
     names = [effect] if Path(effect).is_file() else effect.split("+")
     own_files = [Path(name) for name in names if name.endswith(".py")]
     if save and any(file.resolve().parent != read.folder.resolve() for file in own_files):
         raise UserError(
             f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
         )
-    tracks = {trial.name: track for trial, track in measured_trials(read, Results(results))}
+    tracks = {trial.name: track for trial, track in layout.measured_trials(read, layout.Results(results))}
     before, after, ladder = add(read, tracks, names, report)
     lines = added_in_words(before, after, ladder)
     if save:
         added = [Path(name).stem for name in names]
         path = save_model(read.folder, [*read.settings.model, *added], [file.name for file in own_files])
-        lines.append(f"Saved to {path}; to update all results: {command_for_results(read.folder, results)}")
+        lines.append(f"Saved to {path}; to update all results: {workflow.command_for_results(read.folder, results)}")
     return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder.to_dict("records")}
 
 
@@ -377,9 +368,8 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
 def _propose(results: Path, experiment: Path | None, report: Say) -> Answer:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
     from vinetrack.pipeline.model_stage import propose_effect
-    from vinetrack.results.folder_layout import read_source_experiment
 
-    lines, files = propose_effect(read_source_experiment(results, experiment), results, report)
+    lines, files = propose_effect(layout.read_source_experiment(results, experiment), results, report)
     return lines, {"lines": lines, "files": files}
 
 
@@ -388,10 +378,9 @@ def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
     from vinetrack.diagnosis.ladder import comparison_lines
     from vinetrack.narrative.verdict_text import verdict_line
-    from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 
-    fit, compared = read_fit(Results(results)), read_result(Results(results).comparison)
-    content, diagnosis = compared.to_dict("records"), read_diagnosis(Results(results))
+    fit, compared = layout.read_fit(layout.Results(results)), layout.read_result(layout.Results(results).comparison)
+    content, diagnosis = compared.to_dict("records"), layout.read_diagnosis(layout.Results(results))
     if diagnosis is not None and diagnosis.contradicted_columns:
         return [str(diagnosis), "", *comparison_lines(compared)], content
     if fit.refused:
@@ -430,9 +419,8 @@ def _effects(name: str | None, experiment: Path | None) -> Answer:
     """List all effects with formulas, parameters and units, or explain one."""
     from vinetrack.effects import catalogue, find_effect, own_effects
     from vinetrack.experiment.settings import read_experiment_settings
-    from vinetrack.pipeline.workflow import find_experiment
 
-    folder = Path() if experiment is None else find_experiment(experiment)
+    folder = Path() if experiment is None else workflow.find_experiment(experiment)
     listed = () if experiment is None else read_experiment_settings(folder / "experiment.yaml").effects
     own = own_effects([safe_join(folder, path) for path in listed])
     if name is None:
@@ -560,12 +548,11 @@ def _stage_command(name: str, stage: Stage) -> Callable[..., None]:
     ) -> Answer:
         from vinetrack.experiment.folder import read_experiment
         from vinetrack.experiment.settings import run_settings
-        from vinetrack.pipeline.workflow import RUN, find_experiment
 
-        read = read_experiment(find_experiment(experiment))
+        read = read_experiment(workflow.find_experiment(experiment))
         if unknown := [one for one in trials or () if one not in read.names]:
             raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
-        in_run = RUN in os.environ
+        in_run = workflow.RUN in os.environ
         say = typer.echo if in_run else report
         say(stage.does.rstrip("."))
         lines = stage.run(Job(read, results, run_settings(settings), trials or None, threads, say))
