@@ -41,7 +41,7 @@ BUDGETS = {
     "paper": (858, 4, 35),
     "pipeline": (1982, 7, 6),
     "planning": (1565, 4, 24),
-    "report": (746, 3, 4),
+    "report": (713, 3, 4),
     "results": (332, 2, 8),
     "tracks": (1482, 4, 19),
     "video": (4921, 12, 71),

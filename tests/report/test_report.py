@@ -2,7 +2,6 @@
 
 import base64
 import io
-import math
 import re
 from dataclasses import replace
 from html import unescape
@@ -23,7 +22,6 @@ from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build
 from vinetrack.report.clips import write_clip
@@ -228,13 +226,11 @@ def recordings(*names: str) -> dict:
     return {"calibrations": dict.fromkeys(names, board), "pictures": dict.fromkeys(names, files)}
 
 
-def table_two() -> dict:
-    """The paper's Table II beside our errors and what departures would cause."""
+def paper() -> dict:
+    """A number of the paper beside ours."""
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
-    named = zip(DEPARTURES, (0.057, 0.069, 0.095, 0.110, 0.114), strict=True)
-    departures = [("Fig. 4", 7.0, one.name, size, math.nan, math.nan) for one, size in named]
-    return build.paper_section(as_table([row]), pd.DataFrame(departures, columns=list(DEPARTURE_COLUMNS)), [])
+    return build.paper_section(as_table([row]), [])
 
 
 def power(wary: str = "") -> Power:
@@ -256,7 +252,7 @@ def words(html: str) -> str:
 def test_the_words_of_whole_pages_are_the_stored_ones():
     figures = [build.ReportFigure(k, k, "c", SVG, f"{k}.csv", "a\n1\n") for k in figures_of(*DIAGNOSIS_SECTIONS)]
     whole = replace(read(diagnosis("missing")), ladder=ladder("", "reservoir_depletion"))
-    more = {"sections": [table_two()]} | recordings("a") | result()
+    more = {"sections": [paper()]} | recordings("a") | result()
     adequate = read(diagnosis("adequate"))
     limited = Candidate.from_json(candidate("air_drag", 1.0, largest={"k": 2500.0}))
     (last,) = adequate.rounds

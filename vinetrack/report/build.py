@@ -226,14 +226,13 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 # ------------------------------------------------------------------------------
-# Section of the report that compares the paper's numbers with ours: Table II, `paper.csv`, figures.
+# Section of the report that compares the paper's numbers with ours: `paper.csv`, figures.
 
 
-def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> dict[str, Any]:
+def paper_section(table: pd.DataFrame, figures: Sequence[ReportFigure]) -> dict[str, Any]:
     """Return the section for the template: paragraphs, then tables, then figures."""
     from vinetrack.paper.rows import MARKS
 
-    by_row = {row.row: row for row in rows(table)}
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
     return {
         "key": "paper",
@@ -246,7 +245,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
             "have absorbed a part of it.",
         ],
-        "tables": [*table_two(by_row, departures), every_row(table)],
+        "tables": [every_row(table)],
         "figures": figures,
     }
 
@@ -258,38 +257,6 @@ def tally(table: pd.DataFrame) -> str:
     counts = table["mark"].value_counts()
     parts = [f"{counts[mark]} {mark}" for mark in MARKS if counts.get(mark, 0)]
     return f"{len(table)} rows: {', '.join(parts)}."
-
-
-def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[ReportTable]:
-    """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2)."""
-    causes = {
-        "chamber not refilled": ("depletion_slow", "depletion_fast"),
-        "tail that cannot push": ("slack",),
-        "both": ("depletion_slow_slack", "depletion_fast_slack"),
-    }
-    head = ("pressure, kPa", "printed", "here", *causes)
-    positions = (
-        "Here: mean of the trials minus Eq. (2) with the printed numbers. The last three columns: the error that a "
-        "departure from Eq. (2) would cause, simulated for a vine of 280 mm."
-    )
-    speeds = "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall."
-    cm, m_s = published.POSITION_RMS_CM, published.FINAL_SPEED_RMS_M_S
-    made = []
-    for title, figure, row, column, factor, printed, note in (
-        ("position, cm", "Fig. 4", "position_rms", "rms_position_m", 100, cm, positions),
-        ("final speed, m/s", "Fig. 5", "final_speed_rms", "rms_final_lead_velocity_m_s", 1, m_s, speeds),
-    ):
-        body = []
-        for kPa, error in printed.items():
-            of_figure = departures[(departures["figure"] == figure) & np.isclose(departures["pressure_kPa"], kPa)]
-            found = by_row.get(f"{row}_{kPa:g}kPa")
-            cells = [f"{kPa:g}", f"{error:g}", number(None if found is None else float(found.ours))]
-            for names in causes.values():
-                sizes = sorted(factor * of_figure.loc[of_figure["departure"].isin(names), column])
-                cells.append(" to ".join(dict.fromkeys(map(number, sizes))) or "–")  # the same size once
-            body.append(tuple(cells))
-        made.append(ReportTable(f"Table II, rms of {title}", head, body, frozenset(range(len(head))), note))
-    return made
 
 
 def every_row(table: pd.DataFrame) -> ReportTable:
@@ -388,7 +355,7 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     fitted = Counter(trial.condition for trial in experiment.trials if trial.name in fit.trials)
     if experiment.settings.published:
         figures = _figures(tables, figures_of("paper").values())
-        sections = [paper_section(tables.paper, tables.paper_departures, figures)]
+        sections = [paper_section(tables.paper, figures)]
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
         known |= experiment.user_effects
