@@ -143,7 +143,7 @@ def filmed(**factors: float) -> dict[str, pd.DataFrame]:
 
 def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     """1.1 times Eq. (2) is there first, when Eq. (2) has grown to 0.95 · 280/1.1 = 242 mm."""
-    mean = motions.mean_motions(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9))
+    mean, _ = motions.position_tables(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9))
     plain = motions.follow(TRIALS[0], motions.NONE, 6.44)
     assert set(mean["pressure_kPa"]) == {28.0}
     assert mean["time_s"].min() == 0.0
@@ -154,7 +154,8 @@ def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     np.testing.assert_allclose(mean["lead_position_m"], grown_m, atol=2e-5)
     np.testing.assert_allclose(mean["lead_position_sigma_m"], math.sqrt(0.02) * grown_m, atol=2e-5)
     # 10 % ahead and 4 % behind: the mean is 3 % ahead, single trials √((0.1² + 0.04²)/2) = 7.62 %.
-    (row,) = motions.position_errors(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.96)).itertuples()
+    _, errors = motions.position_tables(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.96))
+    (row,) = errors.itertuples()
     assert row.rms_single_m / row.rms_mean_m == pytest.approx(math.sqrt(0.0058) / 0.03, rel=0.01)
     assert row.n_trials == 2
 

@@ -112,7 +112,14 @@ class Column:
                     return _read_axis(text)
             number, unit = value_and_unit(text, self.name)
             value = parse_number(number, decimal)
-            return self._checked(convert(value, unit, self.unit_key) if unit else value, unit or written_in)
+            value = convert(value, unit, self.unit_key) if unit else value
+            if self.kind == "choice" and value not in (1, 2):
+                raise InputError("is not a travel ratio", code="not_a_choice")
+            if (above := value > self.high) or value < self.low or (self.above_low and value == self.low):
+                code, bound = ("above", self.high) if above else ("below", self.low)
+                message = f"is {'not above' if self.above_low and not above else code} {bound:g} {self.unit}".rstrip()
+                raise InputError(message, self._likely_units(value, unit or written_in), code=f"{code}_bounds")
+            return value
         except InputError as error:
             error.allowed = self.allowed
             raise
@@ -122,16 +129,6 @@ class Column:
         if isinstance(value, bool | list | tuple | dict):
             raise InputError("is not a single value", "write one, as in the sheet", code="not_a_value")
         return self.read(str(value).strip())
-
-    def _checked(self, value: float, written_in: str = "") -> float:
-        """Return the value unchanged if its column allows it."""
-        if self.kind == "choice" and value not in (1, 2):
-            raise InputError("is not a travel ratio", code="not_a_choice")
-        if (above := value > self.high) or value < self.low or (self.above_low and value == self.low):
-            code, bound = ("above", self.high) if above else ("below", self.low)
-            message = f"is {'not above' if self.above_low and not above else code} {bound:g} {self.unit}".rstrip()
-            raise InputError(message, self._likely_units(value, written_in), code=f"{code}_bounds")
-        return value
 
     def unusual(self, value: Any, written_in: str = "") -> str:
         """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""

@@ -177,10 +177,6 @@ def _quality(line: dict[str, Any]) -> str:
     return f", R² {number(line['R2'])}, p = {number(line['p'], 2)}"
 
 
-def _pressure(family: dict[str, Any], unit: str) -> str:
-    return pressure_text(1e3 * family["pressure_kPa"], unit, 4)
-
-
 @figure("speed_scaling", "damping", "Steady speed against size", data="conditions.csv")
 def draw_speed_scaling(scaling: dict[str, Any], pressure_unit: str = "kPa") -> Figure | None:
     """Steady tail speed of scaled copies (one t/D) at one pressure without payload, against diameter, and the same
@@ -205,7 +201,8 @@ def draw_speed_scaling(scaling: dict[str, Any], pressure_unit: str = "kPa") -> F
         for i, family in enumerate(families):
             values, errors = (np.array(family[key.format(part)], dtype=float) for part in ("", "_sigma"))
             n = f"{st.counted([values.size], 'vine')} of {st.counted(family['n_steady'], 'trial')}"
-            trend, pressure = family["over_diameter"] if "over" in key else family, _pressure(family, pressure_unit)
+            trend = family["over_diameter"] if "over" in key else family
+            pressure = pressure_text(1e3 * family["pressure_kPa"], pressure_unit, 4)
             _draw_family(ax, family["sizes"], values, errors, trend, i, f"{pressure}, N = {n}")
         st.up_from_zero(ax, x=True)
         st.legend_above(ax, title=title + more, alignment="left", fontsize=9)
@@ -241,7 +238,8 @@ def draw_efficiency(scaling: dict[str, Any], pressure_unit: str = "kPa") -> Figu
         ax.set_title(definitions[key], fontsize=10.5)
     load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
     more = f"; {n_left} more {'family' if n_left == 1 else 'families'} in scaling.json" if n_left else ""
-    title = f"{_pressure(family, pressure_unit)}{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
+    pressure = pressure_text(1e3 * family["pressure_kPa"], pressure_unit, 4)
+    title = f"{pressure}{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
     fig.suptitle(f"{title}{st.per_point(family['n_efficiency'])}{more}", fontsize=11, x=0.01, ha="left")
     return fig
 

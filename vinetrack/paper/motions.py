@@ -242,12 +242,13 @@ def comparison_tables(
         for trial in replicates
         if trial.name in known
     }
+    means, errors = position_tables(positions, grown)
     payloads_g = sorted({round(1e3 * replicates[0].payload_kg, 6) for replicates in speeds.values()})
     return {
         "paper_departures": departure_table(payloads_g),
         "paper_motions": motion_table(),
-        "paper_means": mean_motions(positions, grown),
-        "paper_positions": position_errors(positions, grown),
+        "paper_means": means,
+        "paper_positions": errors,
         "paper_pressures": pressure_table(),
         "paper_speeds": final_speeds(speeds, grown),
         "paper_speed_curves": speed_curves(speeds),
@@ -286,22 +287,6 @@ def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float
     return all(two is None or math.isclose(one, two, rel_tol=0.02) for one, two in zip(ours, printed, strict=True))
 
 
-def mean_motions(conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %. The
-    release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a trial
-    would absorb its deviation of speed.
-    """
-    parts = []
-    for pressure_kPa, trials in conditions.items():
-        time_s, laid_m = _on_common_times(trials, grown)
-        if not len(laid_m):
-            continue
-        sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
-        columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
-        parts.append(pd.DataFrame(dict(zip(MEAN_COLUMNS, columns, strict=True))))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
-
-
 def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame]) -> tuple[Floats, Floats]:
     """Common times since release, shape (n,), and positions from rest, shape (n_trials, n), of those that are known."""
     motions = []
@@ -319,22 +304,29 @@ def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame])
     return common_s, np.array([np.interp(common_s, *motion) for motion in motions])
 
 
-def position_errors(conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Compare positions with Eq. (2) and the printed B and n, of the mean and of single trials (`POSITION_COLUMNS`).
-    From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
+def position_tables(
+    conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Average the trials of each pressure since release until the first has grown to 95 % (`MEAN_COLUMNS`), and compare
+    mean and single trials with Eq. (2) and the printed B and n until that has, too (`POSITION_COLUMNS`). The release
+    comes from a fit in which each trial has its own pressure and B: with one B it would absorb deviations of speed.
     """
-    rows = []
+    parts, errors = [], []
     for pressure_kPa, trials in conditions.items():
         time_s, laid_m = _on_common_times(trials, grown)
         if not len(laid_m):
             continue
+        sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
+        columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
+        parts.append(pd.DataFrame(dict(zip(MEAN_COLUMNS, columns, strict=True))))
         plain = follow(trials[0], NONE, published.DAMPING_B[4])
         stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trials[0].length_m))
         counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
         off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
         mean_m, single_m = (math.sqrt(float(np.mean(np.square(part_m)))) for part_m in (off_m.mean(axis=0), off_m))
-        rows.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
-    return pd.DataFrame(rows, columns=list(POSITION_COLUMNS))
+        errors.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
+    means = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
+    return means, pd.DataFrame(errors, columns=list(POSITION_COLUMNS))
 
 
 def final_speeds(conditions: Mapping[str, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
