@@ -33,7 +33,7 @@ BUDGETS = {
     "experiment": (1600, 5, 17),
     "figures": (2091, 8, 30),
     "inference": (5185, 14, 49),
-    "interface": (567, 2, 2),
+    "interface": (550, 2, 2),
     "kinematics": (1618, 6, 12),
     "laboratory": (1549, 6, 9),
     "narrative": (1048, 3, 8),

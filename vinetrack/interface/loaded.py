@@ -301,29 +301,8 @@ def read_source(
 
 
 def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
-    """Draw an object of the Python interface as in the report.
-
-    Parameters
-    ----------
-    shown : loaded results, a fit, a comparison, a diagnosis or a power.
-    name : name of the figure; blank for the main figure of the object.
-    trial : name of the trial, for figures of one trial.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ResultsError
-        If the object has no such figure.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
-    >>> type(fit.plot("model_residuals")).__name__
-    'Figure'
+    """Draw results, a fit, a comparison, a diagnosis or a power as in the report: the figure of this name, or the main
+    one; `trial` for figures of one trial. A ResultsError if there is no such figure.
     """
     if isinstance(shown, LoadedResults):
         return _results_figure(shown, name, trial)
