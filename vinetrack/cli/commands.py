@@ -527,11 +527,17 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     import pandas as pd
 
     from vinetrack.figures.style import write_figure
-    from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target, sheet_rows
+    from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 
     power = power_of_target(PowerRequest(target=target, **options))
     lines = [*str(power).splitlines(), *write_figure(figure, power.plot)]
-    if rows_file is not None and (rows := sheet_rows(power)):
+    rows = [
+        {"trial": f"{plan.power.effect if len(power.further) > 1 else 'added'}_{k}"}
+        | {name: value for name, value in trial.items() if name in COLUMNS}
+        for plan in power.further
+        for k, trial in enumerate(plan.trials, 1)
+    ]
+    if rows_file is not None and rows:
         write_csv(rows_file, pd.DataFrame(rows))
         lines.append(f"Rows of the sheet: {rows_file}")
     return lines, power.to_json()

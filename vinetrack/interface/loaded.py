@@ -305,7 +305,19 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     one; `trial` for figures of one trial. A ResultsError if there is no such figure.
     """
     if isinstance(shown, LoadedResults):
-        return _results_figure(shown, name, trial)
+        from vinetrack.pipeline.trials import draw_trial
+
+        if name == "trial_motion":
+            if trial not in (names := list(shown.trials["trial"])):
+                raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
+            stated = next((row for row in shown.experiment.trials if row.name == trial), None)
+            windows = read_json(shown._results.analysed(trial))["windows"]
+            return _with_content(draw_trial(shown._results, stated, trial, windows), name)
+        trials: tuple[Trial, ...] = ()
+        with suppress(Exception):  # without the sheet, the figures have simpler labels
+            trials = shown.experiment.trials
+        of_folder = FigureTables(shown.folder, trials)
+        return _draw_figure(of_folder, name or ("ladder" if len(of_folder.ladder) else "damping_law"))
     if isinstance(shown, Fit):
         shown = compare(shown)
     if isinstance(shown, Power):
@@ -351,22 +363,6 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     trials = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=list(CURVE_COLUMNS))
     conditions = _described([fitted.trial for fitted in shown.fits[0].trials] if shown.fits else [])
     return DiagnosisTables(shown, conditions, trials, diagnosis_tables(shown))
-
-
-def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
-    from vinetrack.pipeline.trials import draw_trial
-
-    if name == "trial_motion":
-        if trial not in (names := list(shown.trials["trial"])):
-            raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        stated = next((row for row in shown.experiment.trials if row.name == trial), None)
-        windows = read_json(shown._results.analysed(trial))["windows"]
-        return _with_content(draw_trial(shown._results, stated, trial, windows), name)
-    trials: tuple[Trial, ...] = ()
-    with suppress(Exception):  # without the sheet, the figures have simpler labels
-        trials = shown.experiment.trials
-    tables = FigureTables(shown.folder, trials)
-    return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))
 
 
 # ------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
+from vinetrack.results import folder_layout as layout
 
 
 @dataclass(frozen=True)
@@ -127,20 +127,20 @@ class Campaign:
         return {aligned.name: aligned for aligned in self.trials}[name]
 
 
-def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
-    """Read the results folder of an experiment."""
-    results = Results(folder)
-    pairs = measured_trials(experiment, results)
+def open_campaign(folder: Path, moved_to: Path | None = None) -> Campaign:
+    """Open a results folder and its experiment, which may have moved."""
+    results, experiment = layout.Results(folder), layout.read_source_experiment(folder, moved_to)
+    pairs = layout.measured_trials(experiment, results)
     data, left_out = prepare(pairs, weighted=False)
     if not data:
-        raise ResultsError(f"{folder} has no trial to explore: {reasons_told(left_out) or 'every trial failed'}")
-    stored = read_fit(results)
+        raise layout.ResultsError(f"{folder} has no trial to explore: {reasons_told(left_out) or 'every trial failed'}")
+    stored = layout.read_fit(results)
     highest_m: dict[str, float] = {}
     if not stored.refused:
-        table = read_result(results.comparison).astype({"condition": str, "expected_high_m": float})
+        table = layout.read_result(results.comparison).astype({"condition": str, "expected_high_m": float})
         highest_m = dict(zip(table["condition"], table["expected_high_m"], strict=True))
-    compared = {name: read_result(results.trajectories(name)) for name in highest_m}
-    effects, unusable = {**catalogue(), **user_effects}, {}
+    compared = {name: layout.read_result(results.trajectories(name)) for name in highest_m}
+    effects, unusable = {**catalogue(), **experiment.user_effects}, {}
     for effect in effects.values():
         try:
             check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))

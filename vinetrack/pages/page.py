@@ -38,8 +38,8 @@ from vinetrack.pages.campaign import (
     SizeControl,
     fit_choice,
     model_text,
+    open_campaign,
     predict_choice,
-    read_campaign,
     sizes_of,
     slider_range,
 )
@@ -47,7 +47,7 @@ from vinetrack.pages.draft_files import save_model
 from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
 # ------------------------------------------------------------------------------
 # Numbers and words of the text panels, which `panels.html` lays out.
@@ -375,8 +375,12 @@ class Page:
 
     def _background_changed(self) -> None:
         background, fitted = self.background, self.background.fitted
-        if self.shown is None and background.prediction is not None:
-            self._show_first_prediction(background.prediction)
+        if self.shown is None and (first := background.prediction) is not None:
+            self.shown = first
+            self._selection_changed()
+            self._update_text()
+            worst = max(first.errors_m, key=lambda name: first.errors_m[name])
+            self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
         if not self.fits and fitted is not None:
             self.fits = [fitted]
             if self.choice is background.initial:
@@ -384,13 +388,6 @@ class Page:
                 self.panel.show(self.choice, fitted.numbers)
             self._update_text()
         self._update_status()
-
-    def _show_first_prediction(self, first: Prediction) -> None:
-        self.shown = first
-        self._selection_changed()
-        self._update_text()
-        worst = max(first.errors_m, key=lambda name: first.errors_m[name])
-        self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread; the status line shows it."""
@@ -542,12 +539,6 @@ def start_server(background: BackgroundFit, port: int | None = None) -> PageServ
         return made
 
     return PageServer(application, port)
-
-
-def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
-    """Open a results folder and its experiment."""
-    source = read_source_experiment(folder, experiment)
-    return read_campaign(folder, source, source.user_effects)
 
 
 def explore(

@@ -155,7 +155,24 @@ def predict_conditions(
     basis = read_basis(**given)
     all_inputs = progress(basis.inputs, "predicting")
     predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
-    content = [_json_entry(prediction) for prediction in predictions]
+    content = [
+        {
+            "condition": one.inputs.trial.condition,
+            "model": list(one.inputs.model.names),
+            "samples": one.samples,
+            "inputs": [_band(of_input) | {"from": str(of_input.why)} for of_input in one.inputs.bands()],
+            "quantities": [_band(quantity) | {"y_over_L": quantity.y_over_L} for quantity in one.quantities],
+            "uncertainties": [
+                {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
+                for s in one.shares
+            ],
+            "left_out": [asdict(omitted) for omitted in one.neglected],
+            "arrives": one.arrives,
+            "slack": one.slack,
+            "warnings": list(map(str, one.hazards)),
+        }
+        for one in predictions
+    ]
     shown = _table_lines(predictions) if len(predictions) > 1 else _condition_lines(predictions[0])
     lines = [*basis.heading, *shown]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
@@ -230,25 +247,6 @@ def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
             conditions_of.setdefault(text, []).append(prediction.inputs.trial.condition)
     for text, conditions in conditions_of.items():
         yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
-
-
-def _json_entry(prediction: vines.VinePrediction) -> dict[str, Any]:
-    """Return one condition as JSON content, SI."""
-    return {
-        "condition": prediction.inputs.trial.condition,
-        "model": list(prediction.inputs.model.names),
-        "samples": prediction.samples,
-        "inputs": [_band(one) | {"from": str(one.why)} for one in prediction.inputs.bands()],
-        "quantities": [_band(one) | {"y_over_L": one.y_over_L} for one in prediction.quantities],
-        "uncertainties": [
-            {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
-            for s in prediction.shares
-        ],
-        "left_out": [asdict(omitted) for omitted in prediction.neglected],
-        "arrives": prediction.arrives,
-        "slack": prediction.slack,
-        "warnings": list(map(str, prediction.hazards)),
-    }
 
 
 def _band(one: Band) -> dict[str, Any]:
@@ -560,18 +558,6 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
     except ValueError:
         remedy = f"write a number in {unit or 'the unit of the parameter'}"
         raise refusal("effect", text, "is not a size", remedy) from None
-
-
-def sheet_rows(power: Power) -> list[dict[str, object]]:
-    """Return the rows of the sheet for the further trials."""
-    return [
-        {
-            "trial": f"{plan.power.effect if len(power.further) > 1 else 'added'}_{k}",
-            **{name: value for name, value in trial.items() if name in COLUMNS},
-        }
-        for plan in power.further
-        for k, trial in enumerate(plan.trials, 1)
-    ]
 
 
 def _simulated_rates(

@@ -228,7 +228,17 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
-    analysed |= _askew_as_failed(experiment, analysed)
+    if experiment.settings.axis is None:
+        # Those whose axis is askew to that of most other trials with the same growth angle failed.
+        slopes_deg = {
+            name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
+            for name, content in analysed.items()
+            if content["row"]["status"] != "failed" and (axis := content.get("axis"))
+        }
+        for names, agreed in askew_trials(slopes_deg, experiment.trials):
+            for name in names:
+                row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
+                analysed[name] = {"row": row, "windows": [], "point": None}
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = table_of(TRIALS_COLUMNS, [rows[name] for name in experiment.names])
@@ -240,20 +250,3 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
     return table
-
-
-def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
-    if experiment.settings.axis is not None:
-        return {}
-    slopes_deg = {
-        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
-        for name, content in analysed.items()
-        if content["row"]["status"] != "failed" and (axis := content.get("axis"))
-    }
-    failed: dict[str, dict[str, Any]] = {}
-    for names, agreed in askew_trials(slopes_deg, experiment.trials):
-        for name in names:
-            row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
-            failed[name] = {"row": row, "windows": [], "point": None}
-    return failed
