@@ -227,9 +227,7 @@ class RuleViolation:
 
 @dataclass(frozen=True)
 class Audit:
-    """Result of an audit: a table of neglected terms and tensions by trial, and warnings. `table`, columns `COLUMNS`,
-    has a row per trial for each neglected term and one for the tension.
-    """
+    """Result of an audit; `table`, columns `COLUMNS`, has a row per trial for each neglected term and the tension."""
 
     table: pd.DataFrame
     violations: tuple[RuleViolation, ...]

@@ -234,9 +234,7 @@ os.register_at_fork(after_in_child=_pool.cache_clear)
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials laid out for the compiled kernel: prepared once, run as often as needed. `stamps`, shape (n_times,), are
-    times since release on the camera's clock, `arrays.times` the true ones.
-    """
+    """Trials laid out for the kernel; `stamps`, (n_times,), are on the clock of the camera, `arrays.times` true, s."""
 
     integrate_many: Callable[..., None]
     stamps: Floats
@@ -278,9 +276,7 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """Lay out trials for the compiled kernel. Shapes: inputs (n_trials, n_fields of `TrialInputs`); stamps (n_times,);
-    starts (n_trials + 1,).
-    """
+    """Lay out trials. Shapes: inputs (n_trials, fields of `TrialInputs`), stamps (n_times,), starts (n_trials + 1,)."""
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
     if host is None:

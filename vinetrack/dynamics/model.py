@@ -135,9 +135,7 @@ class Model(Printed):
         return replace(self, values={**self.values, **values})
 
     def parameters_for(self, vine: str, day: str = "") -> Floats:
-        """Values of all parameters for the trials of one vine, and of one day or set-up. Returns SI, in the order of
-        `parameter_names`. Shape (n_parameters,).
-        """
+        """Parameters of trials of a vine and a day, SI, in the order of `parameter_names`. Shape (n_parameters,)."""
         numbers = []
         for effect in self.effects:
             for parameter in effect.parameters:
@@ -185,10 +183,7 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
-    """Parameters of a model, as parameters of a larger one that contains it. Those that the model lacks are
-    at their `zero`. Shapes: parameters (n_trials, n_parameters of the model) → (n_trials, n_parameters of the
-    host).
-    """
+    """Parameters of a model as those of a larger one, others at `zero`. Shapes: (n_trials, n_parameters of each)."""
     lacking = [name for name in model.names if name not in host]
     if lacking:
         raise EffectError(f"The host model has no effect {', '.join(lacking)}.")

@@ -159,9 +159,7 @@ def _model_panels(
     comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], corner: tuple[float, float, str, str],
     x_label: str, y_label: str,
 ) -> tuple[Figure | None, list[tuple[Axes, list[pd.DataFrame], pd.DataFrame, str]]]:  # fmt: skip
-    """A page of small panels, with the numbers of each in a corner. Returns it, and
-    for every panel its axes, its trials from shortly before anything moves, the longest of them, and its colour.
-    """
+    """A page of small panels, and of each its axes, its trials from before they move, the longest, and its colour."""
     known = comparison[comparison["condition"].isin(list(trajectories))]
     # 60: panels at most (chosen: in rows of eight they are 1.4 in wide, the narrowest that has room for its label)
     farthest = known["rms_position_m"].fillna(0.0).sort_values(ascending=False, kind="stable").index[:60]

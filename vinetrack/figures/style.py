@@ -339,9 +339,7 @@ def with_minus(value: float, form: str) -> str:
 
 
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
-    """Label logarithmic axes with plain numbers, readable even within less than a decade, and let them span a factor of
-    two at least: a single point must not fill the figure with its error bars.
-    """
+    """Label logarithmic axes with plain numbers, and let them span a factor of two at least, also of a single point."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     for axis in {"x": (ax.xaxis,), "y": (ax.yaxis,), "both": (ax.xaxis, ax.yaxis)}[which]:

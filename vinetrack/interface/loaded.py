@@ -50,9 +50,7 @@ if TYPE_CHECKING:
 
 
 class LoadedResults(Printed, Drawn):
-    """A results folder, whose files are read on first access. Tables are pandas DataFrames whose columns carry their
-    units, as in the files (`docs/results.md`).
-    """
+    """A results folder, read on first access. Tables are DataFrames with units in their columns (`docs/results.md`)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

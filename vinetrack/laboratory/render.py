@@ -301,9 +301,7 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
 
 @njit(fastmath=True, nogil=True)
 def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
-    """Sample the backdrop, displaced by (shift_x, shift_y) px, at every pixel of the camera; bilinear, into `out`.
-    Shapes: canvas (canvas_height, canvas_width); map_x, map_y, out (height, width).
-    """
+    """Sample the backdrop, displaced by (shift_x, shift_y) px, bilinear; maps and `out` have shape (height, width)."""
     rows, columns = canvas.shape
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
@@ -670,9 +668,7 @@ class BallLayer:
 
 
 def lay_door(light: Image, scene_motion: SceneMotion, door: Door, frame: int, shake: tuple[float, float]) -> None:
-    """Lay the door over a picture, shape (height, width), in place: a plate hinged beside the resting tip that swings
-    out of the path, averaged over the beginning, middle and end of the exposure.
-    """
+    """Lay the door over a picture, (height, width), in place: it swings out of the path; averaged over the exposure."""
     scene = scene_motion.scene
     scale, (ux, uy) = scene.camera.m_per_px, scene.direction
     axes = np.array([[ux, uy], [-uy, ux]])

@@ -392,10 +392,7 @@ class Job(Generic[Progress, Outcome]):
 
 
 class BackgroundFit:
-    """Computes in a thread the `prediction` of the model in use, then its fit. `failure` is the reason if it
-    failed, else blank. The listeners are called from that thread whenever there is a
-    new result or step.
-    """
+    """Computes in a thread the `prediction` of the model in use, then its fit, or `failure`; tells its listeners."""
 
     def __init__(self, campaign: Campaign) -> None:
         self.campaign = campaign

@@ -294,9 +294,7 @@ EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), (
 
 @dataclass(frozen=True)
 class RecordingView:
-    """The picture of one recording: its axis and half the width of a line across the vine, px of the recording, its
-    track (`tracks/<trial>.csv`), and the shift of each frame along the axis.
-    """
+    """A recording: axis, half the width of a line across it, px, track, and the shift of each frame along the axis."""
 
     path: Path
     axis: Axis

@@ -301,9 +301,7 @@ def draft_from_json(folder: Path, content: Mapping[str, Any]) -> files.Draft:
 
 
 def draft_problems(folder: Path, draft: files.Draft, thorough: bool = False) -> dict[str, Any]:
-    """Return the messages of `vinetrack check` for a draft, of JSON types: `problems`, each with the field concerned,
-    `notes`, what was `understood` of each recording, and the text of each file.
-    """
+    """What `vinetrack check` says of a draft, of JSON types, with the field of each problem; the text of each file."""
     with files.draft_folder(folder, draft) as copy:
         checked = check_folder(copy) if thorough else None
         problems = [*(check_experiment(copy) if checked is None else checked.problems)]
@@ -330,9 +328,7 @@ def _scale_missing(draft: files.Draft) -> list[Problem]:
 
 
 def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, Any]:
-    """A problem with its field: a cell of the sheet, a row, a value for all trials, the scale, the axis, or `whole`;
-    its column is that of the sheet, which may have another unit.
-    """
+    """A problem with its field: a cell, a row, a value for all trials, the scale, the axis, or `whole`."""
     column = problem.column
     if column.split(".")[0] in ("calibration", "axis") and not problem.trial:
         field = column.split(".")[0]

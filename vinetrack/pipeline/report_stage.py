@@ -83,9 +83,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
 
 
 def chosen_trials(experiment: Experiment, results: layout.Results, of: str) -> list[str]:
-    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none; and those
-    whose clip is there already, which would show another model otherwise.
-    """
+    """Names of trials to draw: the first recording of every condition, all, or none; and those that have a clip."""
     trials = layout.read_result(results.trials)
     tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
     filmed = {trial.name: trial.condition for trial in experiment.trials if trial.video and trial.name in tracked}

@@ -42,9 +42,7 @@ SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defin
 
 @dataclass(frozen=True)
 class Condition:
-    """A trial that could be made. `like` is the index, among the trials of the experiment, of the trial it is modelled
-    on: for an existing vine a trial with it, else one with the vine nearest in size.
-    """
+    """A trial that could be made, modelled on that of index `like`: of its vine, else of the vine nearest in size."""
 
     trial: Trial
     like: int

@@ -322,9 +322,7 @@ def _forces(
 
 
 def band(values: Floats) -> Floats:
-    """Return the 5 %, 50 % and 95 % sample quantiles along the first axis, without interpolation (values may be inf).
-    NaN where all draws are NaN. Shapes: values (n_draws, ...) → (3, ...).
-    """
+    """The 5 %, 50 % and 95 % sample quantiles along the first axis, of values that may be inf. Shape (3, ...)."""
     is_empty = np.isnan(values).all(axis=0)
     quantiles = np.asarray(np.nanquantile(np.where(is_empty, 0.0, values), BAND, axis=0, method="inverted_cdf"))
     return np.where(is_empty, np.nan, quantiles)

@@ -247,9 +247,7 @@ class FitNumbers:
             raise FitError(f"{self.source} is not a fit of everting vines: it has no B to predict with.")
 
     def place(self, key: str, vine: str = "", near: float = math.nan) -> int | None:
-        """The index of a parameter, shared or of this vine; None where there is none. Of several yield pressures of a
-        vine, the one nearest to a stated value, else the first.
-        """
+        """The index of a parameter, shared or of this vine, or None; of several P_y that nearest to a stated value."""
         numbers = self.fit.numbers
         of_vine = [one.vine in ("", vine) or one.vine.startswith(f"{vine}, ") for one in numbers]
         places = [k for k, one in enumerate(numbers) if one.key == key and of_vine[k]]
