@@ -34,6 +34,7 @@ from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, write
 from vinetrack.pipeline.planning_stage import read_basis, read_si_range
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.planning.prediction import CURVE_COLUMNS
+from vinetrack.planning.predictive_inputs import predictive_inputs
 
 
 def test_a_page_ends_without_waiting_for_its_thread():
@@ -284,8 +285,8 @@ def test_with_a_fit_comes_an_effect_of_its_experiments_own(tmp_path):
     write_json(results / "fit.json", content)
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (inputs,) = read_basis(cells=values, results=results).inputs
-    assert inputs.model.names[-1] == "spring_line"
+    planned, stated, fit, _ = read_basis(cells=values, results=results)
+    assert predictive_inputs(planned.trials[0], stated, fit).model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     assert run("predict", *FAST, "--fit", results).exit_code == 1
 

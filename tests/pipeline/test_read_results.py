@@ -111,6 +111,12 @@ def folder(path: Path, content: dict | None, after: bool = True) -> Results:
     return results
 
 
+def tables_of(results: Results, trials: pd.DataFrame) -> drawn.DiagnosisTables | None:
+    tables = FigureTables(results.folder, ())
+    tables.trials = trials
+    return tables.diagnosed
+
+
 def test_predictions_count_from_release_and_origin(tmp_path):
     trials = drawn.predicted_trials(folder(tmp_path / "r", diagnosis()), conditions())
     one = trials[trials["trial"] == "a"]
@@ -120,7 +126,7 @@ def test_predictions_count_from_release_and_origin(tmp_path):
 
 
 def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_their_errors(tmp_path):
-    found = drawn.read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
+    found = tables_of(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
@@ -149,14 +155,14 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):
     for verdict in VERDICTS:
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
-        found = drawn.read_diagnosis_tables(results, conditions())
+        found = tables_of(results, conditions())
         assert found is not None
         pictures = {name: figure for name in figures_of(*DIAGNOSIS_SECTIONS) if (figure := draw(name, found))}
         assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
         assert all(len(getattr(found, figures_of(*DIAGNOSIS_SECTIONS)[name].data)) > 0 for name in pictures)
     assert all(render(figure, ["svg"])["svg"] for figure in pictures.values())
     for name, content in (("none", None), ("refused", refused())):
-        assert drawn.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
+        assert tables_of(folder(tmp_path / name, content), conditions()) is None
     assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*DIAGNOSIS_SECTIONS))
 
 

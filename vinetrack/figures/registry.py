@@ -156,8 +156,12 @@ class FigureTables:
 
     @cached_property
     def diagnosed(self) -> DiagnosisTables | None:
-        """Tables of the diagnosis; None if there is none."""
-        return read_diagnosis_tables(self.results, self.trials)
+        """Tables of the diagnosis; None if there is none, or that failed."""
+        diagnosis = read_diagnosis(self.results)
+        if diagnosis is None or not diagnosis.verdict:
+            return None
+        tables = {path.name: read_result(path) for path in (self.results.folder / "diagnosis").glob("*.csv")}
+        return DiagnosisTables(diagnosis, self.trials, predicted_trials(self.results, self.trials), tables)
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
@@ -230,15 +234,6 @@ class DiagnosisTables:
             more = [name for name in ranked.model if name not in rounds[0].model]
             heading = f"is missing with {listed_names(more)} added" if i else "effect is missing from the initial model"
             self.rounds.append((f"Which {heading}?", self.ranking[self.ranking["round"] == i + 1]))
-
-
-def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
-    """Read the tables of a results folder; None if it has no diagnosis, or that failed."""
-    diagnosis = read_diagnosis(results)
-    if diagnosis is None or not diagnosis.verdict:
-        return None
-    tables = {path.name: read_result(path) for path in (results.folder / "diagnosis").glob("*.csv")}
-    return DiagnosisTables(diagnosis, conditions, predicted_trials(results, conditions), tables)
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:

@@ -53,7 +53,6 @@ from vinetrack.planning.predictive_inputs import (
     YIELD,
     Band,
     FitNumbers,
-    PredictiveInputs,
     StatedValues,
     hoop_stress_Pa,
     predictive_inputs,
@@ -87,27 +86,13 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
     return final or in_use, (f"! {verdict}", f"! {caution}")
 
 
-@dataclass(frozen=True)
-class PredictionBasis:
-    """Planned trials, stated values, a fit if there is one; `heading` stands over everything predicted from them."""
-
-    planned: Experiment
-    stated: StatedValues
-    fit: FitNumbers | None
-    heading: tuple[str, ...]
-
-    @property
-    def inputs(self) -> list[PredictiveInputs]:
-        """The predictive inputs of every trial."""
-        return [predictive_inputs(trial, self.stated, self.fit) for trial in self.planned.trials]
-
-
 def read_basis(
     needed: Sequence[str] = REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
     results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), **numbers: Any,
-) -> PredictionBasis:  # fmt: skip
-    """Read the sheet or the options, the fit, and the requested effects. `cells` are texts by column of the sheet, for
-    the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
+) -> tuple[Experiment, StatedValues, FitNumbers | None, tuple[str, ...]]:  # fmt: skip
+    """Read the sheet or the options, the fit, and the requested effects: planned trials, stated values, a fit if any, and
+    the heading over all predicted from them. `cells` are texts by column of the sheet, for the columns that were given;
+    `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
     """
     fit: FitNumbers | None = None
     heading: tuple[str, ...] = ()
@@ -134,7 +119,7 @@ def read_basis(
     names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
     model = planned.settings.model
     stated = StatedValues(**numbers, model=model, effects=names, sizes=sizes, user_effects=user_effects)
-    return PredictionBasis(planned, stated, fit, heading)
+    return planned, stated, fit, heading
 
 
 def refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
@@ -152,8 +137,8 @@ def predict_conditions(
     """Predict all conditions, see `read_basis`; write figure and curves if requested. Returns lines, JSON content."""
     import pandas as pd
 
-    basis = read_basis(**given)
-    all_inputs = progress(basis.inputs, "predicting")
+    planned, stated, fit, heading = read_basis(**given)
+    all_inputs = progress([predictive_inputs(trial, stated, fit) for trial in planned.trials], "predicting")
     predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
     content = [
         {
@@ -174,8 +159,8 @@ def predict_conditions(
         for one in predictions
     ]
     shown = _table_lines(predictions) if len(predictions) > 1 else _condition_lines(predictions[0])
-    lines = [*basis.heading, *shown]
-    lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
+    lines = [*heading, *shown]
+    lines += [f"! {warning}" for warning in format_problems(planned.problems)]
     titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
     lines += write_figure(figure, partial(draw_predictions, predictions, titles, at_fraction))
     if csv is not None:
@@ -271,14 +256,14 @@ def design_vine(
     at_fraction: float, figure: Path | None = None, **given: Any,
 ) -> tuple[list[str], dict[str, Any]]:  # fmt: skip
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
-    basis = read_basis(("pressure_kPa",), **given)
+    planned, stated, fit, heading = read_basis(("pressure_kPa",), **given)
     films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",")]
     room = vines.Room(
         films_m=tuple(dict.fromkeys(films_m)),
         diameter_m=read_si_range("diameter_mm", diameter),
         length_m=read_si_range("length_mm", length),
-        pressure_Pa=basis.planned.trials[0].pressure_Pa,
-        rig=basis.planned.trials[0],
+        pressure_Pa=planned.trials[0].pressure_Pa,
+        rig=planned.trials[0],
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
@@ -287,15 +272,15 @@ def design_vine(
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
         raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with waiting("looking for the fastest vine"):
-        choices = vines.fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    lines = [*basis.heading, *_vine_lines(room, choices), *write_figure(figure, partial(draw_choice, choices))]
+        choices = vines.fastest(room, stated, fit, samples=samples, seed=seed, at_fraction=at_fraction)
+    lines = [*heading, *_vine_lines(room, choices), *write_figure(figure, partial(draw_choice, choices))]
     entries = []
     for choice in choices:
         trial, final = choice.prediction.inputs.trial, choice.prediction.final
         speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
         entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION} | {"final_speed_m_s": speed}
         entries.append({**entry, "fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)})
-    return lines, {"warnings": basis.heading, "films": entries}
+    return lines, {"warnings": heading, "films": entries}
 
 
 def _vine_lines(room: vines.Room, choices: Sequence[vines.Choice]) -> Iterator[str]:
@@ -331,13 +316,13 @@ def design_reservoir(
     *, within_percent: float, supply_s: float, at_fraction: float, figure: Path | None = None, **given: Any
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
-    basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
-    trial, loss, swept = basis.planned.trials[0], within_percent / 100, vines.swept_m3(basis.planned.trials[0])
-    inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
+    planned, stated, fit, heading = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
+    trial, loss, swept = planned.trials[0], within_percent / 100, vines.swept_m3(planned.trials[0])
+    inputs = predictive_inputs(trial, stated, fit) if math.isfinite(trial.thickness_m) else None
     laws = [law.split(",")[0] for law in vines.GAMMAS]
     speeds = [] if inputs is None else [f"speed, {law}" for law in laws]
     lines = [
-        *basis.heading,
+        *heading,
         str(remark("sweeps", trial=trial, swept_m3=swept, in_full=inputs is not None)),
         str(remark("keeps_pressure", percent=within_percent)),
         "",
@@ -368,7 +353,7 @@ def design_reservoir(
     drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
     drawn = partial(draw_reservoir, drawn_m3, _losses(trial, drawn_m3), loss, swept, trial.chamber_m3)
     lines += write_figure(figure, drawn)
-    return lines, {"warnings": basis.heading, "chambers": entries}
+    return lines, {"warnings": heading, "chambers": entries}
 
 
 def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
