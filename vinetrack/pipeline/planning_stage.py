@@ -90,8 +90,8 @@ def read_basis(
     needed: Sequence[str] = REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
     results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), **numbers: Any,
 ) -> tuple[Experiment, StatedValues, FitNumbers | None, tuple[str, ...]]:  # fmt: skip
-    """Read the sheet or the options, the fit, and the requested effects: planned trials, stated values, a fit if any, and
-    the heading over all predicted from them. `cells` are texts by column of the sheet, for the columns that were given;
+    """Read the sheet or the options, the fit, and the effects: planned trials, stated values, a fit if any, and the
+    heading over all predicted from them. `cells` are texts by column of the sheet, for the columns that were given;
     `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
     """
     fit: FitNumbers | None = None

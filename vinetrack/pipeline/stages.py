@@ -164,11 +164,11 @@ def _end_with_parent() -> None:
 # the program, has another key; what no run asks for in a month is dropped.
 
 
-@lru_cache(maxsize=2)
-def code_hash(*rooms: str) -> str:
-    """Hash of the code of some rooms of the package, or of all of it."""
+@lru_cache
+def code_hash() -> str:
+    """Hash of the package."""
     digest = hashlib.sha256()
-    for path in sorted(path for room in rooms or (".",) for path in (PACKAGE / room).rglob("*")):
+    for path in sorted(PACKAGE.rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
@@ -193,8 +193,7 @@ class Kept:
         film, *others = inputs
         assert isinstance(film, Path)
         libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2")]
-        code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
-        state = (code, libraries, film.resolve(), identity(film), others)
+        state = (code_hash(), libraries, film.resolve(), identity(film), others)
         self.tracked = _key(*state)
         return self.made("track", state, make)
 

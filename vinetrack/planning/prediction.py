@@ -8,7 +8,7 @@ are those of the position at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -138,9 +138,7 @@ class VinePrediction:
     @cached_property
     def hazards(self) -> tuple[Remark, ...]:
         """Warnings about the vine, most serious first: burst, no growth, a compressed or slack tail, and the audit."""
-        return (*self._hazards(), *self.inputs.notes)
-
-    def _hazards(self) -> Iterator[Remark]:
+        found: list[Remark] = []
         warned_from = 0.05  # Fraction of draws above which a hazard is reported (chosen)
         inputs, trial = self.inputs, self.inputs.trial
         stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
@@ -148,25 +146,26 @@ class VinePrediction:
         if stress > 0.9 * burst_Pa * (1 + 1e-9):
             highest, guess = (trial.pressure_Pa * burst_Pa / stress, trial.pressure_unit), burst_Pa == BURST_STRESS_PA
             facts = {"MPa": stress / 1e6, "burst_MPa": burst_Pa / 1e6, "highest": highest, "guess": guess}
-            yield remark("bursts" if stress > burst_Pa else "nearly_bursts", **facts)
+            found.append(remark("bursts" if stress > burst_Pa else "nearly_bursts", **facts))
         given = trial.pressure_Pa, *np.quantile(inputs.draw(2000, 1)[YIELD], BAND).tolist()
         if given[0] <= given[2]:
             shown = zip(("pressure", "low", "middle", "high"), given, strict=True)
-            yield remark("below_yield", **{name: (at_Pa, trial.pressure_unit) for name, at_Pa in shown})
+            found.append(remark("below_yield", **{name: (at_Pa, trial.pressure_unit) for name, at_Pa in shown}))
         elif self.arrives < 1 - warned_from:
-            yield remark("stalls", share=1 - self.arrives)
+            found.append(remark("stalls", share=1 - self.arrives))
         if self.slack >= warned_from and trial.tail_slack == "free":
-            yield remark("goes_slack", share=self.slack)
+            found.append(remark("goes_slack", share=self.slack))
         elif self.slack >= warned_from:
             tension, has_payload = self[LEAST_TENSION], trial.payload_kg > 0
             facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
-            yield remark("tail_compressed", share=self.slack, **facts)
+            found.append(remark("tail_compressed", share=self.slack, **facts))
         # The audit along the median motion, except of the tail, whose compression is told above
         (moved,), _ = grown(inputs.model, [trial])
         keep = moved.lead_position_m <= self.at_fraction * trial.length_m
         motion = AuditedMotion(trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
         violations = audit(inputs.model, [motion]).violations
-        yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
+        found += (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
+        return (*found, *self.inputs.notes)
 
     @cached_property
     def neglected(self) -> tuple[Neglected, ...]:
