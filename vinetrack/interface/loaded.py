@@ -25,13 +25,7 @@ from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.result import Diagnosis, Power
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue
-from vinetrack.experiment.folder import (
-    REQUIRED_FOR_PREDICTION,
-    Experiment,
-    planned_rows,
-    read_experiment,
-    table_of_texts,
-)
+from vinetrack.experiment import folder as experiments
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, describe_conditions, draw, figures_of, label_conditions
@@ -67,7 +61,7 @@ class LoadedResults(Printed, Drawn):
         return read_json(self._results.provenance)
 
     @cached_property
-    def experiment(self) -> Experiment:
+    def experiment(self) -> experiments.Experiment:
         """The experiment that the results were made from; raises a ResultsError if it has moved."""
         return folder_layout.read_source_experiment(self.folder)
 
@@ -229,8 +223,10 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = {str(name): part for name, part in frame.groupby("trial", sort=False)}
     cells = [_cells(name, part, position) for name, part in parts.items()]
-    table, _ = in_sheet_units(table_of_texts(cells), "the frame")
-    made = planned_rows(table, ExperimentSettings(), REQUIRED_FOR_PREDICTION, file=Path("the frame"), measured=True)
+    table, _ = in_sheet_units(experiments.table_of_texts(cells), "the frame")
+    made = experiments.planned_rows(
+        table, ExperimentSettings(), experiments.REQUIRED_FOR_PREDICTION, file=Path("the frame"), measured=True
+    )
     return [(trial, _track(trial, parts[trial.name], position)) for trial in made.trials]
 
 
@@ -269,12 +265,12 @@ def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
 # Trials with their tracks from any source: a results folder, an experiment, a frame of tracks, or pairs.
 
 # Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track
-Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
+Source = LoadedResults | experiments.Experiment | Path | str | pd.DataFrame | Pairs
 
 
 def read_source(
     source: Source, tracks: Mapping[str, Track] | None = None
-) -> tuple[list[tuple[Trial, Track]], Experiment | None, dict[str, str]]:
+) -> tuple[list[tuple[Trial, Track]], experiments.Experiment | None, dict[str, str]]:
     """Read trials from any source; `tracks` go before those that an experiment names. Returns pairs of trial and track,
     their experiment (None for a frame and for pairs), and the reasons why trials were left out, by name.
     """
@@ -289,9 +285,9 @@ def read_source(
         pairs = folder_layout.measured_trials(experiment, Results(Path(source)))
         return pairs, experiment, {**experiment.failed, **experiment.left_out}
     if isinstance(source, (str, Path)):
-        source = read_experiment(source)
+        source = experiments.read_experiment(source)
     pairs, left_out = pairs_of(source, tracks)
-    return pairs, source if isinstance(source, Experiment) else None, left_out
+    return pairs, source if isinstance(source, experiments.Experiment) else None, left_out
 
 
 # ------------------------------------------------------------------------------
@@ -475,7 +471,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     """
     from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 
-    if isinstance(source, LoadedResults | Experiment):
+    if isinstance(source, LoadedResults | experiments.Experiment):
         source = source.folder
     if isinstance(source, str | Path):
         return power_of_target(PowerRequest(Path(source), effects, **options))

@@ -23,6 +23,8 @@ from vinetrack.core.terminal import waiting
 from vinetrack.core.units import SLIDER_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE, Diagnosis
 from vinetrack.effects import BASE_EFFECTS
+from vinetrack.figures.registry import features
+from vinetrack.figures.style import vine_styles
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
@@ -287,10 +289,12 @@ class Page:
         self.document.template = plots.templates().get_template("page.html")
         left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
         on_screen = {colour: f"var({token})" for colour, token in TOKENS.items()}
+        styles = vine_styles(campaign.vines)
+        sizes = {aligned.data.trial.vine: features(aligned.data.trial)[0] for aligned in campaign.trials}
         self.document.template_variables.update(
             name=campaign.folder.name,
             style=Markup(page_frame() + style),
-            vines=[(vine, on_screen.get(colour.lower(), colour)) for vine, colour in plots.vine_colours(campaign)],
+            vines=[(sizes[vine], on_screen.get(colour.lower(), colour)) for vine, (colour, _) in styles.items()],
             tally=f"{len(campaign.trials)} trials, {len(campaign.conditions)} conditions{left_out}",
         )
 

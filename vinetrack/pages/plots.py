@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, with_flag
-from vinetrack.figures.registry import features
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
@@ -130,13 +129,6 @@ def progress_bar(share: float, text: str) -> str:
 
 Columns = dict[str, list[Any]]
 Errors = Mapping[str, float]
-
-
-def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return the sizes of each vine in words, and its colour."""
-    styles = vine_styles(campaign.vines)
-    sizes = {aligned.data.trial.vine: features(aligned.data.trial)[0] for aligned in campaign.trials}
-    return [(sizes[vine], styles[vine].colour) for vine in campaign.vines]
 
 
 def round_up(value: float, steps: Sequence[float]) -> float:

@@ -22,21 +22,11 @@ from vinetrack.core.units import PREDICTION_UNITS, display_unit, number, pressur
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.misfit_tests import (
-    FALSE_ALARM_LEVEL_FIRST_ROUND,
-    FALSE_ALARM_LEVEL_LATER_ROUNDS,
-    MisfitTests,
-)
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS, MisfitTests
 from vinetrack.diagnosis.result import ADEQUATE, Power, PowerInput, SimulatedRates
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS, catalogue
-from vinetrack.experiment.folder import (
-    REQUIRED_FOR_PREDICTION,
-    Experiment,
-    planned_sheet,
-    planned_trial,
-    read_experiment,
-)
+from vinetrack.experiment import folder as experiments
 from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import Limits, read_experiment_settings
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, systematic_of_travel
@@ -87,9 +77,9 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
 
 
 def read_basis(
-    needed: Sequence[str] = REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
+    needed: Sequence[str] = experiments.REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
     results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), **numbers: Any,
-) -> tuple[Experiment, StatedValues, FitNumbers | None, tuple[str, ...]]:  # fmt: skip
+) -> tuple[experiments.Experiment, StatedValues, FitNumbers | None, tuple[str, ...]]:  # fmt: skip
     """Read the sheet or the options, the fit, and the effects: planned trials, stated values, a fit if any, and the
     heading over all predicted from them. `cells` are texts by column of the sheet, for the columns that were given;
     `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
@@ -104,9 +94,9 @@ def read_basis(
             f"{sheet} holds results: predict from their fit with --fit {sheet}, and the vine by options"
         )
     if sheet is None:
-        planned = planned_trial(cells, needed=needed)
+        planned = experiments.planned_trial(cells, needed=needed)
     else:
-        planned = planned_sheet(sheet)
+        planned = experiments.planned_sheet(sheet)
         said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
         if cells:
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
@@ -278,7 +268,8 @@ def design_vine(
     for choice in choices:
         trial, final = choice.prediction.inputs.trial, choice.prediction.final
         speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
-        entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION} | {"final_speed_m_s": speed}
+        entry: dict[str, Any] = {name: COLUMNS[name].of_trial(trial) for name in experiments.REQUIRED_FOR_PREDICTION}
+        entry |= {"final_speed_m_s": speed}
         entries.append({**entry, "fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)})
     return lines, {"warnings": heading, "films": entries}
 
@@ -412,7 +403,7 @@ Campaign = tuple[MisfitTests, Mapping[str, Remark], list[PowerInput], Limits]
 def _campaign_of_target(request: PowerRequest) -> Campaign:
     """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
     target, added = request.target, tuple[str, ...]()
-    experiment: Experiment | None = None
+    experiment: experiments.Experiment | None = None
     if (target / PROVENANCE).exists():
         results, experiment = layout.Results(target), layout.read_source_experiment(target, request.experiment)
         diagnosis, pairs = layout.read_diagnosis(results), layout.measured_trials(experiment, results)
@@ -420,9 +411,9 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
             added, pairs = diagnosis.added, diagnosis.settled(pairs)
     else:
         with suppress(ExperimentError):  # recordings that do not exist yet: a plan
-            experiment = read_experiment(target) if target.is_dir() else None
+            experiment = experiments.read_experiment(target) if target.is_dir() else None
         if experiment is None or all(trial.track is None for trial in experiment.trials):
-            return _planned_campaign(request, planned_sheet(target, every_row=True))
+            return _planned_campaign(request, experiments.planned_sheet(target, every_row=True))
         pairs = pairs_of(experiment)[0]
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
@@ -451,7 +442,7 @@ def _measured_campaign(
     return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits or Limits()
 
 
-def _planned_campaign(request: PowerRequest, planned: Experiment) -> Campaign:
+def _planned_campaign(request: PowerRequest, planned: experiments.Experiment) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=planned.user_effects)
