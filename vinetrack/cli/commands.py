@@ -442,20 +442,14 @@ def _effects(name: str | None, experiment: Path | None) -> Answer:
 def _explanation(effect: Effect) -> list[str]:
     """Lines on one effect: the text of its file, its parameters and its relations to other effects."""
     lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
-    rows = [
-        (
-            p.symbol,
-            p.unit,
-            f"{p.default:g}",
-            f"{p.bounds[0]:g} to {p.bounds[1]:g}",
-            f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–",
-            # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
-            "–" if p.zero == p.default else f"{p.zero:g}",
-            "all" if p.shared == "all" else f"each {p.shared}",
-            f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}",
-        )
-        for p in effect.parameters
-    ]
+    rows = []
+    for p in effect.parameters:
+        spans = ["{:g} to {:g}".format(*ends) if ends else "–" for ends in (p.bounds, p.plausible)]
+        # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
+        no_size = "–" if p.zero == p.default else f"{p.zero:g}"
+        shared = "all" if p.shared == "all" else f"each {p.shared}"
+        meaning = f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}"
+        rows.append((p.symbol, p.unit, f"{p.default:g}", *spans, no_size, shared, meaning))
     if rows:
         head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
         lines += ["Parameters, in files by the name in brackets:"]

@@ -52,10 +52,8 @@ def main(arguments: list[str] | None = None) -> None:
                 write_tracks([trial], trial.stated.track.parent)
         if filmed := [trial for trial in grown if trial.stated.video is not None]:
             n_frames = sum(trial.track.time_s.size for trial in filmed)
-            told = (
-                f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest."
-            )
-            print(told, flush=True)
+            told = f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames."
+            print(f"{told} The first takes longest.", flush=True)
             image = getattr(experiment.settings.calibration, "image", None)
             if image is not None:
                 picture_target(filming, experiment.folder / image, truth.seed)

@@ -282,19 +282,11 @@ def _vine_lines(room: vines.Room, choices: Sequence[vines.Choice]) -> Iterator[s
     rows = []
     for choice in choices:
         trial, final = choice.prediction.inputs.trial, choice.prediction.final
-        rows.append(
-            (
-                f"{1e6 * trial.thickness_m:g}",
-                f"{1e3 * trial.diameter_m:.3g}",
-                f"{1e3 * trial.length_m:.3g}",
-                f"{trial.pressure_Pa / 1e3:.3g}",
-                f"{hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m) / 1e6:.2f}",
-                value_in_unit(final.median, "m/s"),
-                f"{value_in_unit(final.low, 'm/s')} to {value_in_unit(final.high, 'm/s')}",
-                f"{choice.odds:.0%}",
-                ", ".join(choice.limits),
-            )
-        )
+        sizes = f"{1e6 * trial.thickness_m:g}", f"{1e3 * trial.diameter_m:.3g}", f"{1e3 * trial.length_m:.3g}"
+        stress_MPa = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m) / 1e6
+        low, median, high = (value_in_unit(value, "m/s") for value in (final.low, final.median, final.high))
+        speed = median, f"{low} to {high}", f"{choice.odds:.0%}"
+        rows.append((*sizes, f"{trial.pressure_Pa / 1e3:.3g}", f"{stress_MPa:.2f}", *speed, ", ".join(choice.limits)))
     head = ("film", "diameter", "length", "pressure", "PD/2t", "speed", "90 % band", "fastest", "limited by")
     yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
     yield ""

@@ -255,19 +255,11 @@ def extended_fit(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> Fit:
 def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
     """The fit with other data and state; its numbers and errors are not computed anew."""
     state = solution.state
-    trials = [
-        trial_fit(
-            trial_data,
-            effects,
-            trial_data.lead_position_m - effects[ORIGIN] - columns[:, -1],
-            -columns[:, RELEASE],
-            state.rho,
-            float(variance),
-        )
-        for trial_data, effects, columns, variance in zip(
-            predictor.data, state.trial_effects, solution.columns, state.variance, strict=True
-        )
-    ]
+    trials = []
+    of_trials = zip(predictor.data, state.trial_effects, solution.columns, state.variance, strict=True)
+    for film, effects, columns, variance in of_trials:
+        position_m = film.lead_position_m - effects[ORIGIN] - columns[:, -1]
+        trials.append(trial_fit(film, effects, position_m, -columns[:, RELEASE], state.rho, float(variance)))
     return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), with_errors=None)
 
 

@@ -387,18 +387,12 @@ def fastest(
     # Inputs that vines share have the same draws in all.
     drawn = np.array([drawn_final_speeds(inputs, at_fraction, samples, seed) for inputs, _ in best])
     fastest_of_draw = np.argmax(drawn, axis=0)
-    choices = [
-        Choice(
-            prediction=replace(
-                predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
-                burst_stress_Pa=room.burst_stress_Pa,
-            ),
-            limits=_limits(room, inputs.trial),
-            odds=float(np.mean(fastest_of_draw == k)),
-            others=others,
-        )
-        for k, (inputs, others) in enumerate(best)
-    ]
+    choices = []
+    for k, (inputs, others) in enumerate(best):
+        predicted = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
+        predicted = replace(predicted, burst_stress_Pa=room.burst_stress_Pa)
+        odds = float(np.mean(fastest_of_draw == k))
+        choices.append(Choice(predicted, _limits(room, inputs.trial), odds, others))
     return tuple(sorted(choices, key=lambda choice: -choice.prediction.final.median))
 
 
