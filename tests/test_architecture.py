@@ -28,7 +28,7 @@ BUDGETS = {
     "cli": (662, 3, 5),
     "core": (982, 7, 26),
     "diagnosis": (5830, 14, 87),
-    "dynamics": (2246, 8, 26),
+    "dynamics": (2235, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 17),
     "figures": (2082, 8, 30),

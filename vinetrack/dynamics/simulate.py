@@ -113,25 +113,14 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
     """The trajectories of a batch that was run."""
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
-    # ("running", "ended", "stalled", "too hard"): in the order of the integrator's codes
-    return [
-        Trajectory(
-            time_s=batch.stamps[a:b],
-            lead_position_m=motion[0, a:b],
-            lead_velocity_m_s=motion[1, a:b],
-            lead_acceleration_m_s2=motion[2, a:b],
-            observed_position_m=out[a:b, 3],
-            travel_ratio=ratio,
-            status=("running", "ended", "stalled", "too hard")[int(status)],
-            end_time_s=end_s,
-            end_lead_velocity_m_s=end_speed / ratio,
-            n_steps=int(n_steps),
-            slack_from_s=slack_from_s,
-        )
-        for ratio, (a, b), (status, end_s, end_speed, n_steps, slack_from_s) in zip(
-            ratios, itertools.pairwise(edges), ends.tolist(), strict=True
-        )
-    ]
+    statuses = ("running", "ended", "stalled", "too hard")  # in the order of the integrator's codes
+    made = []
+    for ratio, (first, last), end in zip(ratios, itertools.pairwise(edges), ends.tolist(), strict=True):
+        (status, end_s, end_speed, n_steps, slack_from_s), time_s = end, batch.stamps[first:last]
+        position, velocity, acceleration = motion[:, first:last]
+        how = statuses[int(status)], end_s, end_speed / ratio, int(n_steps), slack_from_s
+        made.append(Trajectory(time_s, position, velocity, acceleration, out[first:last, 3], ratio, *how))
+    return made
 
 
 def check_completed(ends: Floats, names: Sequence[str]) -> None:
