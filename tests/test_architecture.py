@@ -26,7 +26,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (662, 3, 5),
-    "core": (982, 7, 26),
+    "core": (952, 7, 26),
     "diagnosis": (5830, 14, 87),
     "dynamics": (2235, 8, 26),
     "effects": (565, 3, 7),
