@@ -255,7 +255,7 @@ function lens(event) {
 // ---- the scale ---------------------------------------------------------------------------------------------------
 
 const marks = {from_px: null, to_px: null};
-let [board, ruler] = [null, null];
+let [board, ruler, lastAxis] = [null, null, null];
 
 export function readCalibration() {
   const given = state.calibration ?? {kind: "two_points"};
@@ -347,6 +347,7 @@ export function drawTools() {
   const turned = axis && !row().growth_angle_deg && !sharedValue("growth_angle_deg") ? Math.abs(Math.atan2(axis.to_px[0] - axis.from_px[0], axis.to_px[1] - axis.from_px[1])) * 180 / Math.PI : 0;
   $("turned-words").textContent = `In the picture growth runs ${turned < 135 ? "level" : "upwards"}. How did the vine grow?`;
   $("axis-ends").textContent = axis ? `${[axis.from_px, axis.to_px].map((end) => rounded(end).join(", ")).join(" to ")} px` : "";
+  if (axis) lastAxis = {from_px: axis.from_px, to_px: axis.to_px};
   if (axis?.given) $("axis-scope").value = axis.given;
   const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
   $("moved-points").textContent = moved ? `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.` : "";
@@ -386,7 +387,8 @@ $("axis-scope").onchange = (event) => { if (currentAxis()?.given) setAxis(curren
 $("square").oninput = $("spacing").oninput = suggest; // before the scale is written
 $("scale-tool").oninput = writeScale;
 const clearAxis = () => { if (row().axis) row().axis = ""; else state.axis = null; changed(); redraw(); };
-const drawAcross = () => setAxis({from_px: [0.1 * state.clip.width, state.clip.height / 2], to_px: [0.9 * state.clip.width, state.clip.height / 2]}, $("axis-scope").value);
+// Where none is found: that of the recording looked at before, or level
+const drawAcross = () => setAxis(lastAxis ?? {from_px: [0.1 * state.clip.width, state.clip.height / 2], to_px: [0.9 * state.clip.width, state.clip.height / 2]}, $("axis-scope").value);
 const again = () => { Object.assign(marks, {from_px: null, to_px: null}); ruler = null; writeScale(); };
 const clicks = {"draw-axis": drawAcross, "add-bend": addBend, straighten: () => changeAxis({via_px: []}), "clear-axis": clearAxis, again, "find-target": findTarget};
 for (const [id, act] of Object.entries(clicks)) $(id).onclick = act;
