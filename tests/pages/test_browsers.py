@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from chrome import Chrome, find_chrome
 from explorer_campaign import film_of, make_experiment, make_results
+from plain_scene import write_video
 from ruler_picture import ruler_picture
 from served import Served, Visitor, served_here
 
@@ -240,6 +241,23 @@ def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person
     assert person.chrome.run(f"{HANDLE % 'Bend'} === null")
     assert person.chrome.run("document.querySelector('#over polyline.axis-line') === null")
     assert person.chrome.run("document.activeElement.dataset.handle") == "Start of the growth axis"
+
+
+@pytest.fixture
+def still(clips):
+    write_video(clips / "z_still.mp4", np.full((20, 160, 480), 90, np.uint8))
+
+
+@pytest.mark.usefixtures("still")
+def test_an_axis_that_is_not_found_is_drawn_where_that_of_the_recording_before_lies(person):
+    ends = "document.querySelector('#axis-ends').textContent"
+    found = person.chrome.run(ends)
+    person.press("#trials tbody tr:last-child td.pic button")
+    person.chrome.wait("document.querySelector('#draw-axis').hidden === false", "the offer", 60)
+    assert person.chrome.run(ends) == ""
+    person.press("#draw-axis")
+    person.chrome.wait(f"{ends} !== ''", "the axis")
+    assert person.chrome.run(ends) == found
 
 
 def test_a_frame_is_corrected_and_the_file_contains_the_correction(person, clips):
