@@ -696,7 +696,7 @@ def _path_by_appearance(
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
     evidence = kernels.film_evidence(strip.values, strip.scale, strip.offset, appearance, width)
     # 25, 2: columns behind the first passed one, and ahead of the last, up to which it may lie (chosen)
-    path = np.clip(dividing_path(evidence) - 0.5, passed[0] - 25, passed[1] + 2)
+    path = np.clip(dividing_path(evidence[:, : passed[1] + 3]) - 0.5, passed[0] - 25, passed[1] + 2)
     return path, np.cumsum(evidence + kernels.FILM_BIAS * strip.values.shape[1], axis=1)
 
 
