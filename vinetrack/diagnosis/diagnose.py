@@ -164,7 +164,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
         explanation=in_words(step),
         slips=step.slips,
         cosines=Cosines(names, cosines.tolist()),
-        confounded=confounders_of(tests, BASE_EFFECTS) if step.verdict == ADEQUATE else step.confounded,
+        confounded=confounders_of(tests, BASE_EFFECTS) if step.verdict == ADEQUATE else (),
         fit=tests.fit,
         fits=tuple(one.fit for one in step.answer_set if one.effects[-1].kind != BETWEEN_TRIALS),
         sets=sets if any(len(effects) > 1 for effects in sets) else (),

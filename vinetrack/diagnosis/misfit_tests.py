@@ -116,7 +116,7 @@ def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
 def _may_be_averages(data: Sequence[FitTrial]) -> bool:
     """Whether the noise of positions as they were measured may be that of averages, which neighbours share."""
     own = [one for one in data if one.smoothing is None and rounding_noise(one.lead_position_m) < 0.5 * one.noise_m]
-    return not own or track_correlation(own) > 0.2  # that of averages over two frames is 0.5 (chosen)
+    return not own or track_correlation(own) > 0.25  # half of that of averages over two frames (derived)
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:

@@ -301,7 +301,7 @@ class Cosines(JsonRecord):
 @dataclass(frozen=True, kw_only=True)
 class Round(JsonRecord):
     """One model and its tests against all candidates. `ranking` has the best first, those not testable last;
-    `confounded` are what sizes of added effects, or n of a model that is adequate, may include.
+    `confounded` is what n of a model that is adequate may include.
     """
 
     model: tuple[str, ...] = ()

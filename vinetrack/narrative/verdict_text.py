@@ -385,7 +385,8 @@ def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     """The wider interval of a size that allows for effects the data do not exclude (hull); blank without any."""
     alike: list[Confounder] = []
     for entry in diagnosis.rounds:
-        alike = [rival for rival in entry.confounded if rival.parameter == size.key] or alike
+        rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
+        alike = [rival for rival in (*rivals, *entry.confounded) if rival.parameter == size.key] or alike
     if not alike:
         return ""
     factor = size.shown[1]

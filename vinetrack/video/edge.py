@@ -707,12 +707,11 @@ def _hidden_px(contrast: NDArray[np.float32], edge: Floats, tube: Outline) -> Fl
     """Standard error of an edge behind a post: it may lie anywhere among neighbouring columns that look the same before
     and behind it. Shapes: contrast (n_along,), of every column; edge (n_frames,) → (n_frames,).
     """
-    # 0.15: part of the usual contrast above which a column tells on which side the edge is; 3: columns beside the edge
-    # that need not tell, for its blur (chosen)
+    # 0.15: part of the usual contrast above which a column tells on which side the edge is: half or twice it the same
     first, behind = tube.passed
     telling = contrast > 0.15 * np.median(contrast[first:behind])
     telling[:first] = telling[behind:] = True
-    places, near = np.flatnonzero(telling), 3
+    places, near = np.flatnonzero(telling), BORDER_GAP_PX
     before = places[np.maximum(np.searchsorted(places, edge - near, side="right") - 1, 0)]
     after = places[np.minimum(np.searchsorted(places, edge + near), len(places) - 1)]
     return np.maximum(after - before - 2 * near - 2, 0) / math.sqrt(12)
