@@ -148,6 +148,8 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     results.ladder.unlink()  # as a run does before it writes it again
     assert all_steps(results, now)["added"].tolist() == ["", "leak"]
     assert all_steps(results, now.assign(rms_in_sample_m=1.0))["added"].tolist() == [""], "of other trials"
+    nearly = now.assign(rms_in_sample_m=1.005 * now["rms_in_sample_m"])
+    assert all_steps(results, nearly)["rms_in_sample_m"].iloc[-1] == nearly["rms_in_sample_m"][0], "as this run has it"
     read = replace(read_diagnosis(results), ladder=now)
     assert len(drawn.DiagnosisTables(read, tables={"steps.csv": all_steps(results, now)}).ladder) == 2
 

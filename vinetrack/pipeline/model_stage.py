@@ -217,7 +217,8 @@ def all_steps(results: layout.Results, ladder: pd.DataFrame) -> pd.DataFrame:
     known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
     for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
         if model == ladder["model"][0] and np.isclose(rms_m, ladder["rms_in_sample_m"][0], 1e-2, 0):
-            return pd.concat([former[: k + 1], ladder[1:]], ignore_index=True)
+            reached = ladder[:1].assign(added=former["added"][k])  # with the errors of this run
+            return pd.concat([former[:k], reached, ladder[1:]], ignore_index=True)
     return ladder
 
 
