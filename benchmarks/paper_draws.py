@@ -18,7 +18,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.paper import published
-from vinetrack.paper.motions import LASTS_S, NONE, WITHIN, follow, position_rms_m, position_trials
+from vinetrack.paper.motions import END_FRACTION, LASTS_S, NONE, follow, position_rms_m, position_trials
 
 TRIALS, B_SCATTER, PRESSURE_SCATTER = 4, 0.03, 0.01
 PSI_PA, OTHER_YIELD_PA = 6894.76, 3200.0
@@ -32,7 +32,7 @@ def mean_error_m(trial: Trial, draw: np.random.Generator) -> float:
         B = published.DAMPING_B[4] * math.exp(B_SCATTER * draw.standard_normal())
         scattered = replace(trial, pressure_Pa=trial.pressure_Pa * (1 + PRESSURE_SCATTER * draw.standard_normal()))
         grown.append(follow(scattered, NONE, B).lead_position_m)
-    stop = min(int(np.searchsorted(one, WITHIN * trial.length_m)) for one in (plain.lead_position_m, *grown))
+    stop = min(int(np.searchsorted(one, END_FRACTION * trial.length_m)) for one in (plain.lead_position_m, *grown))
     off_m = np.mean([one[:stop] for one in grown], axis=0) - plain.lead_position_m[:stop]
     return float(np.sqrt(np.mean(off_m**2)))
 

@@ -14,8 +14,8 @@ from vinetrack.core.records import Track
 from vinetrack.figures import damping_figures, motion_figures, overlay
 from vinetrack.figures import diagnosis_figures as figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip
-from vinetrack.figures.style import BLUE, MUTED, ORANGE, RULE_COLOURS, VERMILLION, look, render
+from vinetrack.figures.overlay import TRACKED, draw_strip
+from vinetrack.figures.style import BLUE, MUTED, ORANGE, RULE_COLOURS, SKY, VERMILLION, look, render
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
@@ -167,8 +167,8 @@ def rgb(colour: str) -> np.ndarray:
 
 EDGES = [
     overlay.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
-    overlay.Edge("initial model", BEFORE, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
-    overlay.Edge("with air drag", AFTER, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
+    overlay.Edge("initial model", VERMILLION, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
+    overlay.Edge("with air drag", SKY, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
 ]
 
 
@@ -187,11 +187,11 @@ def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_len
     unseen, picture = (overlay.compose(view, grey, frame, 12.0)[-round(zoom * size[1]) :] for frame in (0, 1))
     assert picture.shape[1] == width_px
     across = 0 if axis.from_px[1] == axis.to_px[1] else 1
-    for colour, place in ((TRACKED, 220), (BEFORE, 320), (AFTER, 230)):
+    for colour, place in ((TRACKED, 220), (VERMILLION, 320), (SKY, 230)):
         seen = np.flatnonzero((picture == rgb(colour)).all(axis=2).any(axis=across))
         assert np.mean(seen) == pytest.approx((place + 0.5) * zoom - 0.5, abs=1)
     assert not (unseen == rgb(TRACKED)).all(axis=2).any()
-    assert (unseen == rgb(BEFORE)).all(axis=2).any()
+    assert (unseen == rgb(VERMILLION)).all(axis=2).any()
     if size[0] == 640:
         # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
         assert max(int(row.sum()) for row in (picture == 255).all(axis=2)) == pytest.approx(80 * zoom, abs=2)
@@ -254,7 +254,7 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors():
     growth, left = figures.draw_before_after("24 kPa", table, "air drag").axes
     shown = [text.get_text() for text in growth.get_legend().get_texts()]
     assert shown == ["measured, N = 2", "model in use: 8.0 mm rms", "with air drag: 1.0 mm rms"]
-    assert {to_hex(line.get_color()) for line in left.lines} >= {figures.BEFORE.lower(), figures.AFTER.lower()}
+    assert {to_hex(line.get_color()) for line in left.lines} >= {VERMILLION.lower(), BLUE.lower()}
     assert left.lines[0].get_ydata()[-1] == pytest.approx(8.0)
 
 

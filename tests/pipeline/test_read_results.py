@@ -15,7 +15,7 @@ from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures import registry as drawn
-from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, FigureTables, draw, figures_of, label_conditions
+from vinetrack.figures.registry import SECTIONS, FigureTables, draw, figures_of, label_conditions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
@@ -159,13 +159,13 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
         found = tables_of(results, conditions())
         assert found is not None
-        pictures = {name: figure for name in figures_of(*DIAGNOSIS_SECTIONS) if (figure := draw(name, found))}
+        pictures = {name: figure for name in figures_of(*SECTIONS[2:-1]) if (figure := draw(name, found))}
         assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
-        assert all(len(getattr(found, figures_of(*DIAGNOSIS_SECTIONS)[name].data)) > 0 for name in pictures)
+        assert all(len(getattr(found, figures_of(*SECTIONS[2:-1])[name].data)) > 0 for name in pictures)
     assert all(render(figure, ["svg"])["svg"] for figure in pictures.values())
     for name, content in (("none", None), ("refused", refused())):
         assert tables_of(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*DIAGNOSIS_SECTIONS))
+    assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*SECTIONS[2:-1]))
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
@@ -248,14 +248,13 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
         propose_effect(None, tmp_path, print)
 
 
-def test_a_figure_is_shown_from_the_files_there_are(tmp_path, monkeypatch):
+def test_a_figure_is_shown_from_the_files_there_are(tmp_path):
     def shown(name: str, limit: int, **files: str) -> str | bytes:
         path = partial(Results(tmp_path).figure, name)
         path(".svg").parent.mkdir(exist_ok=True)
         for form, content in files.items():
             path(f".{form}").write_text(content)
-        monkeypatch.setattr(build, "MAX_SVG_BYTES", limit)
-        return build._picture(path)
+        return build._picture(path, limit)
 
     assert shown("both", 9, png="png", svg="<svg/>") == shown("alone", 9, svg="<svg/>") == "<svg/>"
     assert shown("both", 5) == b"png"

@@ -20,7 +20,8 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, draw_strip
+from vinetrack.figures.overlay import TRACKED, ClipView, draw_strip
+from vinetrack.figures.style import SKY, VERMILLION
 from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.pipeline.trials import analyse_trials
@@ -271,7 +272,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path):
     frame = 35
     picture = pictures[frame - shown.start]
     # 20 mm ahead is 40 px, 5 mm behind 10 px.
-    for colour, place in ((TRACKED, 190), (BEFORE, 230), (AFTER, 180)):
+    for colour, place in ((TRACKED, 190), (VERMILLION, 230), (SKY, 180)):
         target = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
         away = np.abs(picture[-HEIGHT:] - target).sum(axis=2)
         # Half of the colour is lost on lines of three pixels: the column that comes nearest is the line's.

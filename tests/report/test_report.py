@@ -19,7 +19,7 @@ from PIL import Image
 from vinetrack.diagnosis.result import PROBABILITIES, Candidate, Diagnosis, EffectPower, Power
 from vinetrack.effects import catalogue
 from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
-from vinetrack.figures.registry import DIAGNOSIS_SECTIONS, figures_of
+from vinetrack.figures.registry import SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.rows import SIMULATED, as_table
@@ -250,7 +250,7 @@ def words(html: str) -> str:
 
 
 def test_the_words_of_whole_pages_are_the_stored_ones():
-    figures = [build.ReportFigure(k, k, "c", SVG, f"{k}.csv", "a\n1\n") for k in figures_of(*DIAGNOSIS_SECTIONS)]
+    figures = [build.ReportFigure(k, k, "c", SVG, f"{k}.csv", "a\n1\n") for k in figures_of(*SECTIONS[2:-1])]
     whole = replace(read(diagnosis("missing")), ladder=ladder("", "reservoir_depletion"))
     more = {"sections": [paper()]} | recordings("a") | result()
     adequate = read(diagnosis("adequate"))

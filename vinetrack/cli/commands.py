@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
 
-START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
-
 
 @contextmanager
 def errors_as_sentences(log: Path | None) -> Iterator[None]:
@@ -92,10 +90,6 @@ def _log_to(path: Path | None) -> None:
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         logging.getLogger().addHandler(file)
 
-
-# Type of an option by its kind; text for all other kinds
-_TYPES: dict[str, Any] = {"number": float, "count": int, "flag": bool, "texts": list[str]}
-_TYPES |= dict.fromkeys(("path", "picture"), Path)
 
 # What a command returns: lines, the same content for a program, and whether it found a fault, by default not
 Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
@@ -171,7 +165,8 @@ def _parameter(line: Mapping[str, str]) -> inspect.Parameter:
         info = typer.Option(line["option"], rich_help_panel=line["panel"] or None, **said, **bounds)
     else:
         info = typer.Argument(**said)
-    type_ = _TYPES.get(kind, str)
+    types: dict[str, Any] = {"number": float, "count": int, "flag": bool, "texts": list[str], "path": Path}
+    type_ = types.get(kind.replace("picture", "path"), str)
     return _keyword(
         line["field"], type_ if required else type_ | None, info, inspect.Parameter.empty if required else value
     )
@@ -574,13 +569,13 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     design = new_app("design", "Design the fastest vine, or the reservoir it needs.")
     groups: tuple[tuple[typer.Typer, str | None, tuple[Callable[..., None], ...]], ...] = (
-        (app, START, (_setup, _track, _check, _run, _explore)),
-        (app, MORE, (_diagnose, _add, _propose, _power, _predict, _settings, _effects, _compare, _overlay)),
+        (app, "Start here", (_setup, _track, _check, _run, _explore)),
+        (app, "More", (_diagnose, _add, _propose, _power, _predict, _settings, _effects, _compare, _overlay)),
         (design, None, (_vine, _reservoir)),
     )
     for group, panel, commands in groups:
         for one in commands:
             group.command(one.__name__.removeprefix("_"), rich_help_panel=panel)(one)
-    app.add_typer(design, rich_help_panel=MORE)
+    app.add_typer(design, rich_help_panel="More")
     for name, stage in STAGES.items():
         app.command(name, rich_help_panel="Stages of the workflow")(_stage_command(name, stage))

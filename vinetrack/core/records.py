@@ -45,7 +45,6 @@ class Correction:
 
 
 END_FRACTION = 0.95  # Growth beyond this fraction of the length is left out: the moving mass vanishes there (chosen)
-SYSTEMATIC_OF_TRAVEL = 4e-4  # Smooth position error where the lens is unknown, part of the longest travel (chosen)
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class Trial:
     tail_slack: str = "taut"
     tail_store: str = "body"
     position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN where it is not stated
-    systematic_of_travel: float = SYSTEMATIC_OF_TRAVEL  #: that where it is not stated, as a part of the longest travel
+    systematic_of_travel: float = 4e-4  #: that where it is not stated, of the longest travel; lens unknown (chosen)
     specimen: str = ""
     day: str = ""
     order: float = math.nan

@@ -71,7 +71,6 @@ def is_disk_full(error: BaseException) -> bool:
 # Reading and writing of tables and text.
 
 PROVENANCE = "provenance.json"  # Its presence marks a results folder
-MAX_TABLE_BYTES = 200_000_000  # Largest file read as a table (chosen)
 
 STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard output
 
@@ -124,10 +123,10 @@ def parse_number(text: str, decimal: str = ".") -> float:
     return value
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a file that is no recording."""
+def read_bytes(path: Path, most: int = 200_000_000) -> bytes:
+    """Read a file that is no recording, of so many bytes at most (chosen)."""
     try:
-        if file_size(path) <= MAX_TABLE_BYTES:
+        if file_size(path) <= most:
             return path.read_bytes()
     except FileNotFoundError:
         raise InputError(*missing_file_message(path)) from None

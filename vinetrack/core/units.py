@@ -120,7 +120,6 @@ UNITS = {
 
 # Display unit by SI unit, and the factor from SI: masses are shown in grams; "1" is dimensionless
 DISPLAY_UNITS = {"kg": ("g", 1e3), "1": ("", 1.0)}
-SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders
 PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predictions
 
 

@@ -188,9 +188,6 @@ def _cache_folder() -> Path:
     return Path(own)
 
 
-_LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash
-
-
 @lru_cache(maxsize=64)
 def kernel(effects: tuple[Effect, ...]) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`."""
@@ -201,20 +198,19 @@ def kernel(effects: tuple[Effect, ...]) -> ModuleType:
     parts += [numba.__version__, sys.version]
     # The compiled form refers to the modules of the effects by name; a name holds the hash of the file's text.
     parts += [function.__module__ for effect in effects for function in effect.functions.values()]
-    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
-    if digest in _LOADED:
-        return _LOADED[digest]
-    path = _cache_folder() / f"kernel_{digest}.py"
+    name = f"kernel_{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:20]}"
+    if name in sys.modules:  # of equal effects that were read again
+        return sys.modules[name]
+    path = _cache_folder() / f"{name}.py"
     if not path.is_file():
         write_text(path, source)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     module.__dict__["EFFECTS"] = effects
-    sys.modules[path.stem] = module  # numba finds its cached form by the module's name
+    sys.modules[name] = module  # numba finds its cached form by the module's name
     spec.loader.exec_module(module)
-    _LOADED[digest] = module
     return module
 
 

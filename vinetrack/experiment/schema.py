@@ -173,9 +173,6 @@ RIG = {name: column.field for name, column in COLUMNS.items() if column.limit an
 GROUPINGS = tuple(name for name, column in COLUMNS.items() if column.kind == "text" and column.shared)
 
 
-CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
-
-
 def option(column: str) -> str:
     """Return the command-line option for a column of the sheet."""
     return "--" + column.replace("_", "-")
@@ -183,7 +180,7 @@ def option(column: str) -> str:
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Suggest the known name that an unknown one may misspell."""
-    close = difflib.get_close_matches(name, list(known), 1, CLOSE_NAME_RATIO)
+    close = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {close[0]}?" if close else "vinetrack settings lists all names"
 
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem
-from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, SYSTEMATIC_OF_TRAVEL, Trial
+from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, parse_number, read_table, safe_join
 from vinetrack.core.units import UNITS, convert, pressure_text
-from vinetrack.experiment.schema import CLOSE_NAME_RATIO, COLUMNS, SHARED, did_you_mean
+from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean
 from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units
 
 SHEET = "trials.csv"
@@ -198,7 +198,7 @@ def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
         names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
     except (OSError, ValueError):
         return ""
-    close = difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)
+    close = difflib.get_close_matches(path.name.lower(), names, 1)
     return names[close[0]] if close else ""
 
 
@@ -243,4 +243,4 @@ def systematic_of_travel(settings: ExperimentSettings, scaled_elsewhere: bool = 
     """
     # 5e-5: that by a target, of which 0.67 is beside a constant and a scale, on sixteen pictures (measured)
     known = isinstance(settings.calibration, Board) and not scaled_elsewhere
-    return 5e-5 if known else SYSTEMATIC_OF_TRAVEL
+    return 5e-5 if known else Trial.systematic_of_travel

@@ -26,17 +26,8 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Floats
 
-BEFORE, AFTER = st.VERMILLION, st.BLUE
-
 # ------------------------------------------------------------------------------
 # Errors of the models of the ladder, and the condition with the largest error of the initial model, before and after.
-
-# Columns of `ladder.csv`, with label, colour, marker and line style
-_ERRORS = {
-    "rms_in_sample_m": ("in sample", st.BLUE, "o", "-"),
-    "rms_left_out_m": ("on left-out conditions", st.VERMILLION, "s", "-"),
-    "rms_highest_pressure_m": ("on the left-out highest pressure", st.GREEN, "^", st.DASHED),
-}
 
 
 @figure("ladder", "verdict", "The ladder of errors", data="ladder")
@@ -51,7 +42,11 @@ def draw_ladder(ladder: pd.DataFrame, refuted: bool = False) -> Figure | None:
         return None
     fig, ax = st.one_panel(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
     ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
-    for key, (name, colour, marker, line) in _ERRORS.items():
+    for key, name, colour, marker, line in (
+        ("rms_in_sample_m", "in sample", st.BLUE, "o", "-"),
+        ("rms_left_out_m", "on left-out conditions", st.VERMILLION, "s", "-"),
+        ("rms_highest_pressure_m", "on the left-out highest pressure", st.GREEN, "^", st.DASHED),
+    ):
         errors_mm = st.column(ladder, key, 1e3)
         if np.isfinite(errors_mm).any():
             label = f"{name}: {' → '.join(map(number, errors_mm))} mm"
@@ -80,9 +75,9 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     """
     if before_after.empty:
         return None
-    models: dict[str, tuple[str, Any, str]] = {"model_before_m": (BEFORE, (0, (5, 2)), "model in use")}
+    models: dict[str, tuple[str, Any, str]] = {"model_before_m": (st.VERMILLION, (0, (5, 2)), "model in use")}
     if np.isfinite(before_after["model_after_m"]).any():
-        models["model_after_m"] = (AFTER, "-", f"with {added}" if added else "after")
+        models["model_after_m"] = (st.BLUE, "-", f"with {added}" if added else "after")
     fig = st.new_figure(5.2, 4.3)  # two such figures fit side by side on a page of 11 in
     growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
     trials = before_after.groupby("trial", sort=False)
@@ -168,7 +163,7 @@ def draw_drift(drift: pd.DataFrame, added: str, pressure_unit: str = "kPa") -> F
     """The best B in groups of trials, relative to the common law, against a condition on which it should not depend;
     bars are one standard error from the scatter of replicates. With a complete model all are 1.
     """
-    models = {"before": (BEFORE, st.DASHED), "after": (AFTER, "-")}
+    models = {"before": (st.VERMILLION, st.DASHED), "after": (st.BLUE, "-")}
     known = drift[np.isfinite(drift["ratio"].astype(float))] if len(drift) else drift
     if not len(known):
         return None

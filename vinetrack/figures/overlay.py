@@ -108,7 +108,7 @@ def _draw_frame(panel: st.Panel, tracking: Tracking, frame: int, picture: np.nda
 # ------------------------------------------------------------------------------
 # Frames of a clip.
 
-TRACKED, BEFORE, AFTER = "#F0E442", st.VERMILLION, st.SKY  # of Okabe and Ito: everyone tells them apart on any grey
+TRACKED = "#F0E442"  # yellow of Okabe and Ito: with vermillion and sky everyone tells it apart on any grey
 _BAR, _BAR_INK, _GREY = "#16191e", "#f2f4f7", "#9aa3b0"
 
 

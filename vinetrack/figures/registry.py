@@ -49,8 +49,7 @@ class RegisteredFigure:
         return tuple(inspect.signature(self.drawing).parameters)
 
 
-DIAGNOSIS_SECTIONS = ("verdict", "where", "candidates", "drift")
-SECTIONS = ("damping", "model", *DIAGNOSIS_SECTIONS, "paper")
+SECTIONS = ("damping", "model", "verdict", "where", "candidates", "drift", "paper")
 
 _registered: dict[str, RegisteredFigure] = {}
 
@@ -78,7 +77,7 @@ def all_figures() -> dict[str, RegisteredFigure]:
 
 def figures_of(*sections: str) -> dict[str, RegisteredFigure]:
     """Return the figures of some sections of the page by name; without any, of all that an experiment has."""
-    chosen = sections or ("damping", "model", *DIAGNOSIS_SECTIONS)
+    chosen = sections or SECTIONS[:-1]
     return {name: one for section in chosen for name, one in all_figures().items() if one.section == section}
 
 

@@ -34,6 +34,7 @@ from vinetrack.kinematics.force import (
 )
 from vinetrack.kinematics.steady import gated_window, paper_window, quasi_steady_window, user_window
 from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.tracks.importers import FEWEST_POINTS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -159,9 +160,6 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]
     mass_kg_m = trial.payload_kg * tail_m + film_kg * until_m - 0.5 * loss_kg_m * until_m**2
     weight_J = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad) * mass_kg_m
     return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
-
-
-FEWEST_POINTS = 5  # Fewest usable points of a track (derived)
 
 
 class TrialError(ValueError):
@@ -306,9 +304,6 @@ def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
     }
 
 
-LAW_COLUMNS = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_low_95", "B_high_95", "n_trials")
-
-
 def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings) -> list[TrialMotion]:
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
     motions = []
@@ -337,9 +332,7 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
 
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Return laws under several models as one table: a row for each model, method and vine, columns
-    `LAW_COLUMNS`; SI.
-    """
+    """Return laws under several models as one table: a row for each model, method and vine; SI."""
     import pandas as pd
 
     rows = [
@@ -348,4 +341,5 @@ def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
         for method, law in methods.items()
         for vine, vine_law in law["vines"].items()
     ]
-    return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
+    columns = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_low_95", "B_high_95", "n_trials")
+    return pd.DataFrame(rows, columns=list(columns))

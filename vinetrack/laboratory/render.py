@@ -564,8 +564,7 @@ class SceneMotion:
 # ------------------------------------------------------------------------------
 # Moving objects in front of the backdrop: tube, ball and door, each composited over the light of a frame.
 
-TABLE_STEP_PX = 1 / 16  # Steps of the table of covers along the path (chosen)
-PROFILE_PER_PX = 16  # Entries per pixel of the profiles across (chosen)
+PER_PX = 16  # Entries per pixel of the table of covers along the path and of the profiles across (chosen)
 # How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)
 SLOPES = np.linspace(1.0, 4.0, 7)
 
@@ -609,8 +608,8 @@ class TubeLayer:
         slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shade_tube(
             light, *self._maps, self._nearest, *shift, tip,
-            scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
-            setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
+            scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, 1 / PER_PX, len(SLOPES),
+            setback, slope_row, side, core, PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
             tail_to + slack,
             float(scene_motion.tail_end_px(middle_s)), tube.tail_opacity, tube.brightness, tube.tail_texture,
             tube.tip_glow, 0.25 * tube.reflection * tube.brightness, self._ghost_across,
@@ -622,16 +621,16 @@ class TubeLayer:
         fold_px, fold_sigma = 0.28 * self._radius_px, 0.07 * self._radius_px + sigma
         reach = 4.5 * max(sigma * SLOPES[-1], fold_sigma)
         first, last = float(path_px.min()) - fold_px - reach, float(path_px.max()) + reach
-        grid = first, TABLE_STEP_PX, math.ceil((last - first) / TABLE_STEP_PX) + 2
+        grid = first, 1 / PER_PX, math.ceil((last - first) / 1 / PER_PX) + 2
         ahead = coverage_table(path_px, np.array([*(sigma * SLOPES), fold_sigma]), *grid)
         ahead[-1:] -= coverage_table(path_px - fold_px, np.array([fold_sigma]), *grid)
         return ahead, first
 
 
 def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
-    """Profiles across the axis, PROFILE_PER_PX a pixel, shape (n_entries,): setback, slope row, side, core."""
-    half = math.ceil((radius_px + 5) * PROFILE_PER_PX)
-    v = np.abs(np.arange(-half, half + 1)) / PROFILE_PER_PX
+    """Profiles across the axis, PER_PX a pixel, shape (n_entries,): setback, slope row, side, core."""
+    half = math.ceil((radius_px + 5) * PER_PX)
+    v = np.abs(np.arange(-half, half + 1)) / PER_PX
     corner = max(tube.tip_roundness * radius_px, 1e-6)
     into = np.clip((v - radius_px + corner) / corner, 0, 0.985)
     cosine = np.sqrt(1 - into**2)

@@ -23,10 +23,9 @@ from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
+from vinetrack.inference.fit_result import DAMPING, EXPONENT
 from vinetrack.paper import published
 from vinetrack.tracks.position_noise import ar1_noise
-
-DAMPING = "eversion_damping.B"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,4 +186,4 @@ def campaign(
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
     """Parameters of isometric vines as `GroundTruth.values` takes them: the printed B by vine, N·(s/m)ⁿ, and n."""
     by_vine = {trial.vine: published.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
-    return {"eversion_damping.B": by_vine, "eversion_damping.n": published.EXPONENT}
+    return {DAMPING: by_vine, EXPONENT: published.EXPONENT}

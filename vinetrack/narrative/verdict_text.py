@@ -417,15 +417,6 @@ def sizes_in_words(numbers: Sequence[Number]) -> str:
     return ", ".join(map(estimate_text, numbers))
 
 
-# Codes of the first sentence of an explanation, by verdict; those of an adequate and of an unexplained model take more
-_EXPLAINED = {
-    MISSING: "is_missing",
-    AMBIGUOUS: "is_ambiguous",
-    BETWEEN_TRIALS: "trials_differ",
-    ARTEFACT: "is_a_fault",
-}
-
-
 def explain(step: SelectionStep) -> str:
     """Return the explanation of one round: its verdict with the reasons."""
     fit, answers, verdict = step.tests.fit, step.answer_set, step.verdict
@@ -441,7 +432,8 @@ def explain(step: SelectionStep) -> str:
     facts |= {"sizes": sizes_in_words(best.numbers) or "it", "gain": best.delta_chi2, "sigma": abs(best.sigma)}
     reach = ANSWER_SET_DELTA_CHI2 * best.inflation
     facts |= {"hypotheses": "; ".join(map(hypothesis_in_words, answers)), "reach": reach}
-    text = sentence(_EXPLAINED[verdict], facts)
+    codes = {MISSING: "is_missing", AMBIGUOUS: "is_ambiguous", BETWEEN_TRIALS: "trials_differ", ARTEFACT: "is_a_fault"}
+    text = sentence(codes[verdict], facts)
     if several:
         text += f" {sentence('several_missing', {'count': len(best.names), 'names': best.names})}"
     text += remedies_in_words(step)

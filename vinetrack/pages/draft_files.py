@@ -23,6 +23,7 @@ from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_
 from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and_unit
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import SHEET
+from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.tracks.importers import read_track
 from vinetrack.video.survey import entries, is_calibration, list_recordings, natural_order
 from vinetrack.video.track import FEWEST_FRAMES
@@ -195,8 +196,6 @@ def _value(cell: str) -> Any:
 # ------------------------------------------------------------------------------
 # A draft: sheet, settings and corrections not yet written.
 
-FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
-
 
 @dataclass(frozen=True)
 class Draft:
@@ -208,10 +207,10 @@ class Draft:
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
     def texts(self) -> dict[str, str]:
-        """The content of each of `FILES`."""
+        """The content of each of `SHARED_FILES`."""
         out = io.StringIO()
         csv.writer(out, delimiter=self.sheet.delimiter, lineterminator="\n").writerows(cells_of(self.sheet))
-        return dict(zip(FILES, (out.getvalue(), self.settings, corrections_text(self.corrections)), strict=True))
+        return dict(zip(SHARED_FILES, (out.getvalue(), self.settings, corrections_text(self.corrections)), strict=True))
 
 
 def open_draft(folder: Path) -> Draft:
@@ -236,7 +235,7 @@ def open_draft(folder: Path) -> Draft:
 
 def files_stamp(folder: Path) -> str:
     """Return a fingerprint of the present files."""
-    paths = [folder / name for name in FILES]
+    paths = [folder / name for name in SHARED_FILES]
     return hashlib.sha256(repr([path.is_file() and path.read_bytes() for path in paths]).encode()).hexdigest()
 
 
@@ -252,7 +251,7 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
         SETTINGS: not (folder / SETTINGS).exists() or read_settings_text(folder) != texts[SETTINGS],
         CORRECTIONS_FILE: corrections_text(read_corrections(folder)[0]) != texts[CORRECTIONS_FILE],
     }
-    written = [name for name in FILES if changed[name]]
+    written = [name for name in SHARED_FILES if changed[name]]
     for name in written:
         tables.write_text(folder / name, texts[name])
     return written
@@ -265,7 +264,7 @@ def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
         copy = Path(temporary) / (folder.resolve().name or "experiment")
         copy.mkdir()
         for path in folder.iterdir():
-            if path.name not in FILES:
+            if path.name not in SHARED_FILES:
                 (copy / path.name).symlink_to(os.path.realpath(path), target_is_directory=path.is_dir())
         for name, text in draft.texts().items():
             tables.write_text(copy / name, text)
@@ -458,7 +457,6 @@ def list_pictures(folder: Path) -> list[str]:
 
 
 TABLES = (".csv", ".txt", ".tsv", ".trk")  # Endings of files that may be tracks
-NOTES = (".txt", ".md", ".tsv", ".csv")  # and of notes on the recordings
 
 
 def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
@@ -466,7 +464,7 @@ def list_tables(folder: Path, suffixes: Sequence[str] = (".csv",)) -> list[str]:
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / tables.PROVENANCE).exists())]
     found = [path for place in folders for path in entries(place) if path.suffix.lower() in suffixes]
     names = (path.relative_to(folder).as_posix() for path in found)
-    return sorted((name for name in names if name not in FILES), key=natural_order)
+    return sorted((name for name in names if name not in SHARED_FILES), key=natural_order)
 
 
 def list_tracks(folder: Path) -> list[str]:

@@ -24,7 +24,6 @@ from tornado.web import Application, ErrorHandler
 from vinetrack.core.problems import UserError
 
 LOOPBACK = "127.0.0.1"
-FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
 TEMPLATES = Path(__file__).with_name("templates")
 TOKENS_CSS = Path(__file__).parents[1] / "report" / "templates" / "page_tokens.css"  # Colours of either scheme
@@ -42,7 +41,8 @@ class PageServer:
 
     def __init__(self, make: Callable[[str], Application], port: int | None) -> None:
         self.loop = IOLoop.current()
-        for number in [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]:
+        # Chosen: ports that no well-known service uses; 30 pages on one machine, then any free port
+        for number in [port] if port is not None else [*range(5070, 5100), 0]:
             with contextlib.suppress(OSError):
                 sockets = bind_sockets(number, LOOPBACK)
                 break

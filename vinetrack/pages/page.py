@@ -20,7 +20,7 @@ from tornado.ioloop import IOLoop
 
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
 from vinetrack.core.terminal import waiting
-from vinetrack.core.units import SLIDER_UNITS, display_unit, number
+from vinetrack.core.units import DISPLAY_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE, Diagnosis
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.figures.registry import features
@@ -94,7 +94,8 @@ class SizeSlider:
 
     def __init__(self, size: SizeControl, value: float, disabled: bool, moved: Callable[[str, float], None]) -> None:
         self.size = size
-        unit, self._factor = display_unit(size.parameter.unit, size.pressure_unit, SLIDER_UNITS)
+        shown = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}
+        unit, self._factor = display_unit(size.parameter.unit, size.pressure_unit, shown)
         what = size.vine or size.parameter.meaning
         self._opened = slider_range(size.key, size.parameter, value)
         self.slider = bk.Slider(
@@ -231,7 +232,6 @@ class TrialSelector:
 # ------------------------------------------------------------------------------
 # The controller of an open page.
 
-REDRAW_MS = 4  # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
 # Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
 TEXT_MS = 150
 
@@ -318,7 +318,7 @@ class Page:
         self._sizes_changed = True
         if self._job is not None:
             self._end_job("The fit was cancelled: the model has changed.")
-        self._soon(self._redraw, REDRAW_MS)
+        self._soon(self._redraw)
 
     def _selection_changed(self) -> None:
         self.plots.set_shown(self.selector.shown)
@@ -329,7 +329,7 @@ class Page:
         self.choice = self.background.initial if self.last is None else self.last.choice
         self._sizes_changed = False
         self.panel.show(self.choice, {} if self.last is None else self.last.numbers)
-        self._soon(self._redraw, REDRAW_MS)
+        self._soon(self._redraw)
 
     def _hold(self) -> None:
         """Hold the current model for comparison; pressed again, compare with the model in use."""
@@ -415,8 +415,10 @@ class Page:
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
-    def _soon(self, work: Callable[[], None], delay_ms: int) -> None:
-        """Do it once after a delay, however often it is asked for until then."""
+    def _soon(self, work: Callable[[], None], delay_ms: int = 4) -> None:
+        """Do it once after a delay, however often it is asked for until then: by default a quarter of a screen's frame,
+        so that several moves of a slider cause one redraw.
+        """
         if work in self._pending:
             return
 

@@ -276,7 +276,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         },
         "pictures": files.list_pictures(folder),
         "traces": files.list_tables(folder),
-        "notes": files.list_tables(folder, files.NOTES),
+        "notes": files.list_tables(folder, (".txt", ".md", ".tsv", ".csv")),
     }
 
 

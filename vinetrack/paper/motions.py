@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack import effects
-from vinetrack.core.records import Floats, Trial, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
 from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
@@ -39,9 +39,6 @@ def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> fl
     """Return the volume of a whole vine over that of its chamber."""
     return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
 
-
-# Fraction of the length up to which positions are compared (chosen)
-WITHIN = 0.95
 
 LASTS_S = 60.0  # Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2) (chosen)
 
@@ -127,7 +124,7 @@ def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
 
 def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
     """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
-    stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
+    stop = int(np.searchsorted(plain.lead_position_m, END_FRACTION * trial.length_m))
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
 
@@ -174,7 +171,7 @@ def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, floa
     the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is ½ρ A C_D ẋ². Speeds
     are those of Eq. (2) without drag.
     """
-    case = published.DRAG_EXAMPLE
+    case = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "pressure_kPa": 56.0}  # as printed
     for fraction, lead in zip(fractions, speeds_at(fractions, case), strict=True):
         share = 0.5 * AIR_DENSITY_KG_M3 * 0.82 * lead**2 / (1e3 * case["pressure_kPa"])  # 0.82: the printed C_D
         yield fraction, share, 8 * share
@@ -202,8 +199,7 @@ def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
     """A row of the damping fit that only the published rule uses, from a motion without noise."""
     stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
     track = plain_track(moved.time_s[:stop], moved.lead_position_m[:stop])
-    fewest, cv = published.STEADY_FEWEST_POINTS, published.STEADY_CV
-    window = paper_window(track, travel_ratio=trial.travel_ratio, cv_limit=cv, min_points=fewest)
+    window = paper_window(track, travel_ratio=trial.travel_ratio)
     unknown = dict.fromkeys(("x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N"), math.nan)
     return {
         "trial": trial.name,
@@ -227,7 +223,6 @@ SPEED_COLUMNS = (
     *("condition", "vine", "pressure_kPa", "payload_g", "n_final", "final_at_mm"),
     *("final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s", "eq2_lead_velocity_m_s"),
 )
-MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
 
 
 def comparison_tables(
@@ -294,7 +289,7 @@ def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame])
         if trial.name in grown:
             time_s, grown_m = (grown[trial.name][name].to_numpy(float) for name in ("time_s", "lead_position_m"))
             known = np.isfinite(grown_m)
-            beyond = np.flatnonzero(known & (grown_m >= WITHIN * trial.length_m))
+            beyond = np.flatnonzero(known & (grown_m >= END_FRACTION * trial.length_m))
             stop = int(beyond[0]) + 1 if beyond.size else grown_m.size
             motions.append((time_s[:stop][known[:stop]], grown_m[:stop][known[:stop]]))
     if not motions:
@@ -307,10 +302,11 @@ def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame])
 def position_tables(
     conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Average the trials of each pressure since release until the first has grown to 95 % (`MEAN_COLUMNS`), and compare
-    mean and single trials with Eq. (2) and the printed B and n until that has, too (`POSITION_COLUMNS`). The release
+    """Average the trials of each pressure since release until the first has grown to 95 %, and compare mean and single
+    trials with Eq. (2) and the printed B and n until that has, too (`POSITION_COLUMNS`). The release
     comes from a fit in which each trial has its own pressure and B: with one B it would absorb deviations of speed.
     """
+    names = ["pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials"]
     parts, errors = [], []
     for pressure_kPa, trials in conditions.items():
         time_s, laid_m = _on_common_times(trials, grown)
@@ -318,14 +314,14 @@ def position_tables(
             continue
         sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
         columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
-        parts.append(pd.DataFrame(dict(zip(MEAN_COLUMNS, columns, strict=True))))
+        parts.append(pd.DataFrame(dict(zip(names, columns, strict=True))))
         plain = follow(trials[0], NONE, published.DAMPING_B[4])
-        stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trials[0].length_m))
+        stop = int(np.searchsorted(plain.lead_position_m, END_FRACTION * trials[0].length_m))
         counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
         off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
         mean_m, single_m = (math.sqrt(float(np.mean(np.square(part_m)))) for part_m in (off_m.mean(axis=0), off_m))
         errors.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
-    means = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
+    means = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names, dtype=float)
     return means, pd.DataFrame(errors, columns=list(POSITION_COLUMNS))
 
 

@@ -14,7 +14,7 @@ from vinetrack.planning.predictive_inputs import (  # noqa: F401
 )
 from vinetrack.planning.predictive_inputs import PRINTED_EXPONENT as EXPONENT  # noqa: F401
 
-STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03  # Definition of a steady window (published)
+STEADY_CV = 0.03  # Largest coefficient of variation of speed in a steady window (published)
 CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)
 CHAMBER_L = 3.7  # Volume of the chamber, litres (published)
 LONGEST_VINE_MM = 280.0  # Length of the largest vine, 24 mm in diameter (published)
@@ -27,15 +27,9 @@ FINAL_SPEED_RMS_M_S = {14: 0.27, 28: 0.56, 41: 1.35}
 FINAL_SPEED_AT_MM = 120.0  # Travel at which the final speed of Fig. 5 is evaluated (published)
 FINAL_SPEED_THICKNESS_UM = 150.0  # Wall of the vines of Fig. 5 (published)
 STEADY_SPEED_KPA, STEADY_SPEED_R2 = 24.0, 0.935  # Steady speed against scale (published)
-THICKNESS_SERIES_DIAMETER_MM = 12.0  # Diameter of the vines whose B is plotted against thickness (Fig. 7B) (published)
 EFFICIENCY_KPA = 34.0  # Pressure of the energy efficiency with payload, Fig. 9 (published)
 # The fastest vine, without payload, at a pressure just below its burst pressure
 FAST_VINE = {"thickness_um": 100.0, "diameter_mm": 25.0, "length_mm": 400.0, "pressure_kPa": 62.0}
-# One vine of the dye injector, and length and diameter of its chamber (published)
-INJECTOR = {"thickness_um": 50.0, "diameter_mm": 2.5, "length_mm": 12.5, "pressure_kPa": 48.0}
-INJECTOR_CHAMBER_MM = (20.0, 15.0)
-# A vine whose drag is stated to stay small up to its pressure (published)
-DRAG_EXAMPLE = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "pressure_kPa": 56.0}
 
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:

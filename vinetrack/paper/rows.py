@@ -24,30 +24,21 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.damping import regress
 from vinetrack.paper import motions, published
 from vinetrack.paper.published import SOURCE
-from vinetrack.planning.prediction import gauge_left
+from vinetrack.planning.prediction import GAMMAS, gauge_left
 from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
 
-COMPUTED = "computed"
 SIMULATED = "simulated from printed parameters"
 MEASURED = "measured"
 NOT_CHECKABLE = "not checkable"
 
 MARKS = {
-    COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
+    "computed": f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
     "where the two differ",
     SIMULATED: "found in virtual trials that were grown from the printed B and n: agreement checks the analysis, not "
     "the paper",
     MEASURED: "found in trials that were filmed",
     NOT_CHECKABLE: "rests on something that is not printed: a setting, a scatter, or a B that had to be guessed",
 }
-
-PAPER_COLUMNS = (
-    *("row", "where", "quantity", "setting", "unit", "published", "as_printed"),
-    *("ours", "ours_low_95", "ours_high_95", "mark", "how", "beside"),
-)
-
-
-GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 
 nan = math.nan
 
@@ -81,12 +72,13 @@ def row_of(
         beside = text["beside"].format(**facts)
     except KeyError:  # The trials did not give what it tells
         beside = ""
-    filled = {key: text[key].format(**facts) for key in ("row", "where", "quantity", "setting", "unit", "as_printed")}
+    filled = {key: text[key].format(**facts) for key in ("row", "where", "quantity", "setting", "unit")}
+    as_printed = text["as_printed"].format(**facts) or (f"{published_as:g}" if math.isfinite(published_as) else "")
     unanswered = kind in (SIMULATED, MEASURED) and not math.isfinite(ours)
     return {
         **filled,
         "published": published_as,
-        "as_printed": filled["as_printed"] or (f"{published_as:g}" if math.isfinite(published_as) else ""),
+        "as_printed": as_printed,
         "ours": ours,
         "ours_low_95": interval[0],
         "ours_high_95": interval[1],
@@ -97,8 +89,8 @@ def row_of(
 
 
 def as_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`."""
-    table = pd.DataFrame(rows, columns=list(PAPER_COLUMNS))
+    """Return the rows as the table `paper.csv`."""
+    table = pd.DataFrame(rows)
     twice = table.loc[table["row"].duplicated(), "row"].tolist()
     if twice:
         raise ValueError(f"rows stand twice: {', '.join(twice)}")
@@ -291,10 +283,10 @@ def _close(ours: float, printed: float) -> bool:
 
 def _wall_rows(mark: str, damping: Mapping[str, Any], scaling: Mapping[str, Any]) -> Iterator[Row]:
     vines = (damping.get("both_axes") or {}).get("vines") or {}
-    family: Mapping[str, Any] = {}
+    family: Mapping[str, Any] = {}  # of the diameter of Fig. 7B, 12 mm
     for candidate in scaling.get("thickness") or ():
         diameters_mm = [vines.get(vine, {}).get("diameter_mm", nan) for vine in candidate["vines"]]
-        if any(abs(mm / published.THICKNESS_SERIES_DIAMETER_MM - 1) < 0.01 for mm in diameters_mm):
+        if any(abs(mm / 12.0 - 1) < 0.01 for mm in diameters_mm):
             family = candidate
     walls = ", ".join(f"{size:g}" for size in family.get("sizes", ()))
     yield row_of("B_power_of_wall", **_fitted(family.get("power") or {}), mark=mark, walls=walls)
@@ -359,9 +351,9 @@ def computed_rows() -> Iterator[Row]:
     printed_change, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
     yield row_of("chamber_volume_change", 100 * change, published_as=printed_change)
     for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
-        for speed, gamma in GAMMAS.items():
+        for law, gamma in GAMMAS.items():
             drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
-            facts: Row = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
+            facts: Row = {"kPa": kPa, "speed": law.split(",")[0], "process": law.split()[1]}
             yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed_change, allowed=allowed, **facts)
     R2, n = published.STEADY_SPEED_R2, len(published.DAMPING_B)
     yield row_of("steady_speed_p_value", p_value(R2, n), published_as=0.32, n=n)  # 0.32: as printed
@@ -378,11 +370,10 @@ def computed_rows() -> Iterator[Row]:
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
-    vine, (length_mm, diameter_mm) = published.INJECTOR, published.INJECTOR_CHAMBER_MM
+    # One vine of the dye injector, 2.5 mm × 12.5 mm at 48 kPa, and its chamber, 20 mm long and 15 mm in diameter
     injected = 100 * 0.017  # Relative change of its pressure
-    chamber_m3 = motions.area_m2(diameter_mm) * length_mm / 1e3
-    change = motions.volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
-    slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
+    change = motions.volume_change(motions.area_m2(15.0) * 20.0 / 1e3, 2.5, 12.5)
+    slow, fast = (100 * (1 - gauge_left(1e3 * 48.0, change, gamma)) for gamma in GAMMAS.values())
     yield row_of("injector_volume_change", 100 * change, published_as=injected)
     yield row_of("injector_gauge_drop", slow, published_as=injected, fast=fast)
     for R, printed in published.DAMPING_B.items():

@@ -39,7 +39,7 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
-from vinetrack.kinematics.summary import LAW_COLUMNS, TrialMotion, law_table, look_at_motions, redo_damping
+from vinetrack.kinematics.summary import TrialMotion, law_table, look_at_motions, redo_damping
 from vinetrack.narrative.diagnosis_text import proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
@@ -183,21 +183,19 @@ def write_diagnosis(
 ) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; `motions` are needed if a model was extended."""
     ladder = layout.table_of(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder
-    tables = {"damping_laws.csv": layout.table_of(LAW_COLUMNS), "steps.csv": all_steps(results, ladder)}
-    tables |= diagnosis_tables(diagnosis)
-    folder = _emptied(results.folder / "diagnosis")
+    laws, steps, folder = {}, all_steps(results, ladder), _emptied(results.folder / "diagnosis")
     if len(diagnosis.fits) > 1:
-        laws, of_trials = {}, motions()  # with the pressure that each model of the ladder predicts
+        of_trials = motions()  # with the pressure that each model of the ladder predicts
         for fit in diagnosis.fits:
             try:
                 laws["+".join(fit.model.names)] = redo_damping(fit.model, of_trials, settings)
             except ValueError as error:
                 log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
-        tables["damping_laws.csv"] = law_table(laws) if laws else layout.table_of(LAW_COLUMNS)
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
+    tables = {"damping_laws.csv": law_table(laws), "steps.csv": steps, **diagnosis_tables(diagnosis)}
     for name, table in tables.items():
         write_csv(folder / name, table)
-    write_csv(results.kept_steps, tables["steps.csv"])
+    write_csv(results.kept_steps, steps)
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, ladder)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
-from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Trial
+from vinetrack.core.records import Trial
 from vinetrack.core.tables import PROVENANCE, write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.threads import in_one_blas_thread
@@ -450,7 +450,7 @@ def _planned_campaign(request: PowerRequest, planned: experiments.Experiment) ->
     elif math.isnan(systematic_m):
         longest_m = max((trial.length_m for trial in planned.trials if math.isfinite(trial.length_m)), default=0.0)
         systematic_m = systematic_of_travel(settings) * longest_m
-        is_known = systematic_of_travel(settings) < SYSTEMATIC_OF_TRAVEL
+        is_known = systematic_of_travel(settings) < Trial.systematic_of_travel
         systematic_origin = f"guess: {'lens by a target' if is_known else 'positions by a scale, lens uncorrected'}"
     trials, rates = [], []
     for trial in planned.trials:
@@ -516,7 +516,7 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
         return name, math.nan
     known = {entry.effect: display_unit(entry.unit, entry.pressure_unit) for entry in power.effects}
     if name not in known:
-        close = difflib.get_close_matches(name, [*known, *power.not_testable], 1, 0.6)
+        close = difflib.get_close_matches(name, [*known, *power.not_testable], 1)
         remedy = f"did you mean {close[0]}?" if close else "without a name, vinetrack power lists the candidates"
         message = "is in the model already" if name in power.model else "is not a candidate for these trials"
         raise refusal("effect", name, message, remedy)

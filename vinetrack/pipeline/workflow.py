@@ -81,7 +81,7 @@ def path_problems(*folders: Path) -> list[Problem]:
 # ------------------------------------------------------------------------------
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
 
-SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
+SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")  # Those that the set-up page writes
 TRIALS_PER_JOB = 100  # Largest number of trials of one job (chosen: as recordings two cores take one or two minutes)
 
 

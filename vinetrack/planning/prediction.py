@@ -79,13 +79,6 @@ def drawn_final_speeds(
     return final_speeds(inputs.model, trials, at_fraction, rows)
 
 
-CURVE_COLUMNS = (
-    "condition", "y_over_L", "lead_position_m",
-    "time_s", "time_low_90_s", "time_high_90_s",
-    "lead_velocity_m_s", "lead_velocity_low_90_m_s", "lead_velocity_high_90_m_s", "tail_velocity_m_s",
-    "tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa",
-)  # fmt: skip
-
 TIME = "time to get there"
 EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
@@ -109,7 +102,7 @@ class Neglected:
 
 @dataclass(frozen=True)
 class VinePrediction:
-    """Prediction of one trial. `curve` has a row for each place along the growth, columns `CURVE_COLUMNS`. `shares` is
+    """Prediction of one trial. `curve` has a row for each place along the growth, with 90 % bands. `shares` is
     the uncertainty budget: the band of `final` with one uncertain input each, widest first. `arrives` and `slack` are
     the fractions of draws that reach the end, and whose tail is compressed or slack.
     """
@@ -279,9 +272,11 @@ def predict_vine(
     tell(LEAST_TENSION, math.nan, least_N, "N")
     tell("hoop stress PD/2t", math.nan, np.array([stress_Pa]), "Pa")
 
-    time, speed, tension, pressure = (band(of)[[1, 0, 2]] for of in (time_s, lead_m_s, tension_N, pressure_Pa))
-    condition = np.full(along.size, trial.condition, dtype=object)
-    columns = (condition, along, places_m, *time, *speed, r * speed[0], *tension, pressure[0] / 1e3)
+    curve: dict[str, Any] = {"condition": trial.condition, "y_over_L": along, "lead_position_m": places_m}
+    for name, unit, drawn in (("time", "s", time_s), ("lead_velocity", "m_s", lead_m_s), ("tension", "N", tension_N)):
+        low, median, high = band(drawn)
+        curve |= {f"{name}_{unit}": median, f"{name}_low_90_{unit}": low, f"{name}_high_90_{unit}": high}
+        curve |= {"tail_velocity_m_s": r * median} if name == "lead_velocity" else {}
     shares = []
     for uncertainty in inputs.uncertainties:
         # 400: draws for the band of one uncertainty alone (derived)
@@ -292,7 +287,7 @@ def predict_vine(
         inputs=inputs,
         at_fraction=at_fraction,
         quantities=tuple(quantities),
-        curve=pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))),
+        curve=pd.DataFrame(curve | {"pressure_kPa": band(pressure_Pa)[1] / 1e3}),
         shares=tuple(sorted(shares, key=lambda share: share.low - share.high)),
         arrives=float(np.mean(np.isfinite(end_s))),
         slack=float(np.mean(slack)),

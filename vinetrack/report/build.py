@@ -341,8 +341,6 @@ def model_errors(table: pd.DataFrame, refuted: bool = False) -> str:
 # ------------------------------------------------------------------------------
 # What the report shows of a results folder, and the page.
 
-MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
-
 
 def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Collect tables, figures and recordings of a results folder, by their names in the templates."""
@@ -378,10 +376,12 @@ def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str
     }
 
 
-def _picture(path: Callable[[str], Path]) -> str | bytes:
-    """Return a figure for the page: its SVG, or its PNG if there is none or it is too large; empty if there is none."""
+def _picture(path: Callable[[str], Path], most: int = 1_500_000) -> str | bytes:
+    """Return a figure for the page: its SVG of so many bytes at most (a tenth of what a report may have), else
+    its PNG; empty if there is none.
+    """
     svg, png = path(".svg"), path(".png")
-    if svg.exists() and svg.stat().st_size <= MAX_SVG_BYTES:
+    if svg.exists() and svg.stat().st_size <= most:
         return svg.read_text(encoding="utf-8")
     return png.read_bytes() if png.exists() else b""
 

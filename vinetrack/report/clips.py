@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, Trial, with_flag
 from vinetrack.core.tables import replacing, write_bytes, write_csv
 from vinetrack.experiment.settings import OverlaySettings
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
-from vinetrack.figures.style import GREEN, render
+from vinetrack.figures.overlay import TRACKED, ClipView, Edge, compose, draw_strip, levels
+from vinetrack.figures.style import GREEN, SKY, VERMILLION, render
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.video.axis import Axis, axis_entry, axis_from_entry
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.survey import Measurement
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chosen)
-FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a prediction into the picture (derived)
 
 
 def write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
@@ -107,8 +107,8 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
         predicted, to_px = read_result(path), position_to_px(track)
         diagnosis = read_diagnosis(results)
         added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
-        models = [("model_before_m", "model in use", BEFORE, 2.0)]
-        models += [("model_after_m", f"with {added}", AFTER, 1.4)] if added else []
+        models = [("model_before_m", "model in use", VERMILLION, 2.0)]
+        models += [("model_after_m", f"with {added}", SKY, 1.4)] if added else []
         time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
         for column, label, colour, reach in models:
             prediction = predicted[["time_s", column]].dropna()
