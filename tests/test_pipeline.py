@@ -17,7 +17,7 @@ from commanded import run, succeed
 from lsoda_vine import grown_position, vine_trial
 
 import vinetrack
-from vinetrack.cli import commands
+from vinetrack.cli import main as commands
 from vinetrack.pipeline.stages import STAGES
 
 ROOT = Path(__file__).parents[1]

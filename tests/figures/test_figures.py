@@ -11,10 +11,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from vinetrack.core.records import Track
-from vinetrack.figures import damping_figures, motion_figures, overlay
+from vinetrack.figures import damping_figures, motion_figures
 from vinetrack.figures import diagnosis_figures as figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
-from vinetrack.figures.overlay import TRACKED, draw_strip
+from vinetrack.figures.motion_figures import TRACKED, draw_strip
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, RULE_COLOURS, SKY, VERMILLION, look, render
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
@@ -166,9 +166,9 @@ def rgb(colour: str) -> np.ndarray:
 
 
 EDGES = [
-    overlay.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
-    overlay.Edge("initial model", VERMILLION, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
-    overlay.Edge("with air drag", SKY, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
+    motion_figures.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
+    motion_figures.Edge("initial model", VERMILLION, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
+    motion_figures.Edge("with air drag", SKY, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
 ]
 
 
@@ -182,9 +182,10 @@ EDGES = [
     ids=["along", "larger", "down"],
 )
 def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(axis, size, width_px):
-    view, grey = overlay.ClipView("a", axis, EDGES, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
+    view = motion_figures.ClipView("a", axis, EDGES, 40.0, size, 0.25, 30.0, width_px)
+    grey = np.full(size[::-1], 90, np.uint8)
     zoom = width_px / size[0]
-    unseen, picture = (overlay.compose(view, grey, frame, 12.0)[-round(zoom * size[1]) :] for frame in (0, 1))
+    unseen, picture = (motion_figures.compose(view, grey, frame, 12.0)[-round(zoom * size[1]) :] for frame in (0, 1))
     assert picture.shape[1] == width_px
     across = 0 if axis.from_px[1] == axis.to_px[1] else 1
     for colour, place in ((TRACKED, 220), (VERMILLION, 320), (SKY, 230)):
@@ -195,7 +196,7 @@ def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_len
     if size[0] == 640:
         # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
         assert max(int(row.sum()) for row in (picture == 255).all(axis=2)) == pytest.approx(80 * zoom, abs=2)
-    assert overlay.levels(np.array([[10, 60, 110, 200]], np.uint16), 10, 110).tolist() == [[0, 128, 255, 255]]
+    assert motion_figures.levels(np.array([[10, 60, 110, 200]], np.uint16), 10, 110).tolist() == [[0, 128, 255, 255]]
 
 
 # The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames.

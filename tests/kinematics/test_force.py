@@ -14,9 +14,9 @@ from vinetrack.core.records import Kinematics, Track, Trial, plain_track
 from vinetrack.dynamics.model import base_model
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import RunSettings
-from vinetrack.kinematics import force as module
+from vinetrack.kinematics import steady as module
 from vinetrack.kinematics import summary
-from vinetrack.kinematics.force import Release, SteadyForce, TrialMotion, Window, find_release, flag_rest
+from vinetrack.kinematics.steady import Release, SteadyForce, TrialMotion, Window, find_release, flag_rest
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 AREA = math.pi * 0.012**2

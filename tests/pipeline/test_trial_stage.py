@@ -20,7 +20,7 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.figures.overlay import TRACKED, ClipView, draw_strip
+from vinetrack.figures.motion_figures import TRACKED, ClipView, draw_strip
 from vinetrack.figures.style import SKY, VERMILLION
 from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.stages import Job, Kept, map_unordered

@@ -12,7 +12,7 @@ import pytest
 from hand_sheet import one_vine
 from test_pipeline import write_campaign
 
-from vinetrack.cli import commands
+from vinetrack.cli import main as commands
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.diagnosis.result import Diagnosis

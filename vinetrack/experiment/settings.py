@@ -288,7 +288,7 @@ class FigureSettings(_Strict):
 
 
 class OverlaySettings(_Strict):
-    """Clips of the recordings with tracked and modelled edges; see `vinetrack.figures.overlay`."""
+    """Clips of the recordings with tracked and modelled edges; see `vinetrack.figures.motion_figures`."""
 
     of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
     """Which recordings get a clip."""

@@ -21,18 +21,21 @@ from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left_out
-from vinetrack.kinematics.force import (
+from vinetrack.kinematics.steady import (
     SteadyForce,
     TrialMotion,
     Window,
     find_release,
     flag_rest,
+    gated_window,
     known_pressure,
     paper_force_N,
+    paper_window,
+    quasi_steady_window,
     steady_force,
+    user_window,
     why_not_in_fit,
 )
-from vinetrack.kinematics.steady import gated_window, paper_window, quasi_steady_window, user_window
 from vinetrack.kinematics.velocity import estimate_kinematics
 from vinetrack.tracks.importers import FEWEST_POINTS
 

@@ -22,6 +22,8 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.filming import compile_the_tracker, film, make_filming, picture_target, recording_experiment
 from vinetrack.laboratory.tracks import grow, read_ground_truth, write_tracks
 
+DEMO = Path(__file__).with_name("demo.yaml")
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command described above."""
@@ -33,7 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
     named = Path(__file__).with_name(f"{experiment.name}.yaml")
-    path = given.nature or (named if named.exists() else named.with_name("demo.yaml"))
+    path = given.nature or (named if named.exists() else DEMO)
     truth, content = read_ground_truth(path), yaml.safe_load(path.read_text(encoding="utf-8"))
     filming = make_filming(content.get("filming", {}))
     if given.film is not None:

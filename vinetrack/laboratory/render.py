@@ -621,7 +621,7 @@ class TubeLayer:
         fold_px, fold_sigma = 0.28 * self._radius_px, 0.07 * self._radius_px + sigma
         reach = 4.5 * max(sigma * SLOPES[-1], fold_sigma)
         first, last = float(path_px.min()) - fold_px - reach, float(path_px.max()) + reach
-        grid = first, 1 / PER_PX, math.ceil((last - first) / 1 / PER_PX) + 2
+        grid = first, 1 / PER_PX, math.ceil((last - first) * PER_PX) + 2
         ahead = coverage_table(path_px, np.array([*(sigma * SLOPES), fold_sigma]), *grid)
         ahead[-1:] -= coverage_table(path_px - fold_px, np.array([fold_sigma]), *grid)
         return ahead, first

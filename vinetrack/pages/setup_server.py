@@ -31,7 +31,7 @@ from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experi
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
-from vinetrack.figures.overlay import draw_strip
+from vinetrack.figures.motion_figures import draw_strip
 from vinetrack.figures.style import render
 from vinetrack.pages import draft_files as files
 from vinetrack.pages.local_page import TEMPLATES, TOKENS_CSS, PageServer, jpeg, page_frame

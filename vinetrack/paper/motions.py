@@ -22,8 +22,7 @@ from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.kinematics.damping import fit_laws
-from vinetrack.kinematics.force import paper_force_N
-from vinetrack.kinematics.steady import paper_window
+from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
 from vinetrack.paper import published
 from vinetrack.planning.prediction import gauge_left

@@ -24,8 +24,7 @@ from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import load_effect
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
-from vinetrack.figures.motion_figures import draw_trial_motion
-from vinetrack.figures.overlay import draw_strip
+from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
 from vinetrack.figures.registry import features
 from vinetrack.figures.style import blank
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, Trial, with_flag
 from vinetrack.core.tables import replacing, write_bytes, write_csv
 from vinetrack.experiment.settings import OverlaySettings
-from vinetrack.figures.overlay import TRACKED, ClipView, Edge, compose, draw_strip, levels
+from vinetrack.figures.motion_figures import TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.style import GREEN, SKY, VERMILLION, render
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
