@@ -15,7 +15,7 @@ from vinetrack.figures import damping_figures, motion_figures
 from vinetrack.figures import diagnosis_figures as figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.motion_figures import TRACKED, draw_strip
-from vinetrack.figures.style import BLUE, MUTED, ORANGE, RULE_COLOURS, SKY, VERMILLION, look, render
+from vinetrack.figures.style import BLUE, MUTED, ORANGE, SKY, VERMILLION, look, render
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
@@ -114,10 +114,12 @@ def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge():
     track = kinematics.assign(flag=np.where(time_s == 0.007, "rejected", ""))
     kinematics = kinematics.assign(lead_velocity_m_s=1.0, lead_velocity_sigma_m_s=0.02)
     found = {"x_ss_m_s": 2.0, "x_ss_sigma_m_s": 0.01, "from_s": 0.05, "to_s": 0.15}
-    windows = [{"rule": rule, "accepted": rule == "gated", **found} for rule in RULE_COLOURS]
+    windows = [
+        {"rule": rule, "accepted": rule == "gated", **found} for rule in ("gated", "quasi_steady", "paper", "user")
+    ]
     title = "W" * 60 + " · 24 mm × 200 µm × 280 mm · 28 kPa · 35.6 g"
     figure = motion_figures.draw_trial_motion(title, track, kinematics, pd.DataFrame(windows))
-    level = next(line for line in figure.axes[0].lines if to_hex(line.get_color()) == RULE_COLOURS["gated"].lower())
+    level = next(line for line in figure.axes[0].lines if to_hex(line.get_color()) == BLUE.lower())
     assert list(level.get_ydata()) == [1.0, 1.0]
     assert_nothing_is_cut_off(figure)
 

@@ -207,6 +207,7 @@ SCALING = {
 }
 P_Y_FOUND = Number("yield_pressure.P_y", "24mm-200um-280mm", "P_y", "Pa", 2950.0, nan, 2900.0, nan, nan, "linear")
 FIT = FitSummary(names=("yield_pressure",), numbers=(P_Y_FOUND,))
+MOVED = ("figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s")
 
 
 def found(**changes: object) -> dict:
@@ -215,7 +216,7 @@ def found(**changes: object) -> dict:
     speeds = pd.DataFrame(speeds, columns=list(motions.SPEED_COLUMNS))
     sizes = dict(zip((one.name for one in motions.DEPARTURES), (0.057, 0.069, 0.095, 0.110, 0.114), strict=True))
     departures = [("Fig. 4", 7.0, name, size, nan, nan) for name, size in sizes.items()]
-    departures = pd.DataFrame(departures, columns=list(motions.DEPARTURE_COLUMNS))
+    departures = pd.DataFrame(departures, columns=list(MOVED))
     fast = {"diameter_mm": 25.0, "thickness_um": 100.0, "pressure_kPa": 62.0, "payload_g": 0.0}
     fast |= {"final_at_mm": 380.0, "final_lead_velocity_m_s": 46.0, "n_final": 1}
     conditions = pd.DataFrame([fast]).reindex(columns=list(CONDITION_COLUMNS))
@@ -226,7 +227,7 @@ def found(**changes: object) -> dict:
 
 def nothing() -> dict:
     columns = {"positions": motions.POSITION_COLUMNS, "speeds": motions.SPEED_COLUMNS}
-    columns |= {"departures": motions.DEPARTURE_COLUMNS, "conditions": CONDITION_COLUMNS}
+    columns |= {"departures": MOVED, "conditions": CONDITION_COLUMNS}
     empty = {name: pd.DataFrame(columns=list(names), dtype=float) for name, names in columns.items()}
     return found(damping={}, scaling={}, fit=FitSummary(()), **empty)
 

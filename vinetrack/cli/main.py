@@ -33,7 +33,7 @@ from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, safe_join, writ
 from vinetrack.core.terminal import table, waiting
 from vinetrack.experiment.schema import COLUMNS, Column, option
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.stages import STAGES, Job, Kept, Stage, code_hash, compilation_told, identity
+from vinetrack.pipeline.stages import STAGES, Job, Stage, compilation_told
 from vinetrack.results import folder_layout as layout
 
 if TYPE_CHECKING:
@@ -269,30 +269,23 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
 
 def _run_lines(folder: Path) -> tuple[list[str], bool]:
     """Summarise finished results in at most twelve lines: failed trials, report, the table in short, the verdict last,
-    or why there is none and what to do; and whether most trials failed or there is no verdict. They are kept, since
-    reading a diagnosis takes most of a second.
+    or why there is none and what to do; and whether most trials failed or there is no verdict.
     """
+    from vinetrack.narrative.diagnosis_text import failures_told, table_lines
+    from vinetrack.narrative.verdict_text import verdict_line, verdict_table
+
     results = layout.Results(folder)
-
-    def summary() -> tuple[list[str], bool]:
-        from vinetrack.narrative.diagnosis_text import failures_told, table_lines
-        from vinetrack.narrative.verdict_text import verdict_line, verdict_table
-
-        trials, diagnosis = layout.read_result(results.trials), layout.read_diagnosis(results)
-        told, failed = failures_told(trials)
-        lines = [f"Report: {results.report}"] if failed or not told else [told, f"Report: {results.report}"]
-        if diagnosis is not None and diagnosis.verdict:
-            lines += table_lines(diagnosis, in_short=True)
-            notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
-            then = verdict_table(diagnosis)[0].note
-            lines += [*notes, f"{verdict_line(diagnosis)}{f'. {then}' if then else ''}"]
-        elif diagnosis is not None and not failed:
-            told, failed = diagnosis.explanation, True
-        then = "The report gives the reason of every trial: mend that of the first, and run again."
-        return [*lines, f"error: {told.rstrip('.')}. {then}"] if failed else lines, failed
-
-    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
-    return Kept(folder).made("lines", state, summary)
+    diagnosis, (told, failed) = layout.read_diagnosis(results), failures_told(layout.read_result(results.trials))
+    lines = [f"Report: {results.report}"] if failed or not told else [told, f"Report: {results.report}"]
+    if diagnosis is not None and diagnosis.verdict:
+        lines += table_lines(diagnosis, in_short=True)
+        notes = [f"! {note}" for note in diagnosis.notes[:1] if len(lines) < 11]
+        then = verdict_table(diagnosis)[0].note
+        lines += [*notes, f"{verdict_line(diagnosis)}{f'. {then}' if then else ''}"]
+    elif diagnosis is not None and not failed:
+        told, failed = diagnosis.explanation, True
+    then = "The report gives the reason of every trial: mend that of the first, and run again."
+    return [*lines, f"error: {told.rstrip('.')}. {then}"] if failed else lines, failed
 
 
 @command()

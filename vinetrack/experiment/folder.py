@@ -233,9 +233,6 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
 # Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior
 REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 
-# Columns about recordings: optional for a planned trial, and ignored but for the rate
-_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
-
 
 def planned_trial(values: Mapping[str, str], needed: Sequence[str] = REQUIRED_FOR_PREDICTION) -> Experiment:
     """Read a trial from texts by name of column, as given on the command line.
@@ -301,6 +298,8 @@ def planned_rows(
     pressure and a scatter of the pressure that are not given are NaN, and all are vines, unless they are `measured`.
     Problems name the sheet, or without a file the options.
     """
+    # Columns about recordings: optional for a planned trial, and ignored but for the rate
+    of_recordings = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     remedy = "remove `use: no` from at least one row"
     problems = [] if rows else [Problem("no_rows", "has no trial in use", remedy=remedy)]
@@ -312,14 +311,14 @@ def planned_rows(
             row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
         row.check_wall()
         row.check_pressures()
-        problems += [problem for problem in row.problems if measured or problem.column not in _RECORDING_COLUMNS]
+        problems += [problem for problem in row.problems if measured or problem.column not in of_recordings]
     if not file.name:
         problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]
     problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
     if any(problem.severity == "error" for problem in problems):
         raise ExperimentError(problems)
     for row in rows if not measured else ():
-        row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
+        row.values = {name: value for name, value in row.values.items() if name not in of_recordings[:-1]}
         row.values.setdefault("pressure_sigma_kPa", math.nan)
         if "yield_pressure_kPa" not in row.values:
             row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)

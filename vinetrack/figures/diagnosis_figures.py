@@ -104,13 +104,6 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
 # ------------------------------------------------------------------------------
 # Candidates of the diagnosis and their gains, and parameters that drift with a condition.
 
-# By role of a candidate: label, colour and opacity
-_ROLES = {
-    "answer": ("in the answer set", st.BLUE, 1.0),
-    "physical": ("explains less", st.MUTED, 0.75),
-    "measurement": ("fault of the measurement", st.ORANGE, 0.75),
-}
-
 
 @figure("candidates", "candidates", "Candidates", data="ranking")
 def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None:
@@ -121,13 +114,18 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
     drawn = [(title, table) for title, ranked in rounds if len(table := _drawable(ranked))]
     if not drawn:
         return None
+    roles = {
+        "answer": ("in the answer set", st.BLUE, 1.0),
+        "physical": ("explains less", st.MUTED, 0.75),
+        "measurement": ("fault of the measurement", st.ORANGE, 0.75),
+    }
     heights_in = [0.33 * len(table) + 0.95 for _, table in drawn]
     fig = st.new_figure(8.6, sum(heights_in) + 0.35)
     axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
     for ax, (title, table) in zip(axes, drawn, strict=True):
         longest = max(float(table["height"].max()), 1.0)
         for i, row in enumerate(st.rows(table)):
-            colour, alpha = _ROLES[row.role][1], None if row.in_answer_set else 0.75
+            colour, alpha = roles[row.role][1], None if row.in_answer_set else 0.75
             fill = colour if row.status == "refitted" else "none"
             ax.barh(i, row.height, height=0.62, color=fill, edgecolor=colour, lw=1.2, alpha=alpha)
             if words := f"{row.size}{'' if row.plausible else ' (not plausible)'}".strip():
@@ -142,7 +140,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
         ax.set_xticks([tick for tick in ax.get_xticks() if tick <= 1.08 * longest])
     axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
     present = {role for _, table in drawn for role in table["role"]}
-    handles = [st.patch_key(words, colour, alpha) for role, (words, colour, alpha) in _ROLES.items() if role in present]
+    handles = [st.patch_key(words, colour, alpha) for role, (words, colour, alpha) in roles.items() if role in present]
     if any((table["status"] == "screened").any() for _, table in drawn):
         handles.append(st.patch_key("predicted, not fitted", "none", edgecolor=st.MUTED))
     st.page_legend(fig, handles, len(handles), handlelength=1.3)

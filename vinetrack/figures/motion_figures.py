@@ -78,8 +78,9 @@ def draw_trial_motion(
     lead.plot(moving_s, st.column(kinematics, "lead_position_m", 1e3), color=st.INK, lw=1.1)
     speed.fill(moving_s, speed_m_s - two_sigma_m_s, speed_m_s + two_sigma_m_s, color=st.MUTED, alpha=0.28, lw=0)
     speed.plot(moving_s, speed_m_s, color=st.INK, lw=1.3)
+    colours = {"gated": st.BLUE, "quasi_steady": st.PURPLE, "paper": st.VERMILLION, "user": st.GREEN}
     for i, row in enumerate(st.rows(windows)):
-        colour, ends_s = st.RULE_COLOURS[row.rule], [row.from_s, row.to_s]
+        colour, ends_s = colours[row.rule], [row.from_s, row.to_s]
         if np.isfinite(row.x_ss_m_s):
             dashes: Any = "-" if row.accepted else (0, (1.5, 1.2))
             speed.plot(ends_s, [row.x_ss_m_s / travel_ratio] * 2, color=colour, lw=3.2, alpha=0.9, ls=dashes)

@@ -37,9 +37,6 @@ BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", 
 VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
 VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-# Colour of each rule for steady windows
-RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "user": GREEN}
-
 DASHED: Any = (0, (4, 2))  # Line of the second of two models, methods or laws
 
 

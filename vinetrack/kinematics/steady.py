@@ -233,8 +233,6 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
     )
 
 
-BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
-
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
 
 BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside the band
@@ -358,8 +356,9 @@ def _longest_steady(
                 size, at = length - span, first + (length - span) // 2
                 highest_low = maximum_filter1d(speed - error, size)[at]
                 lowest_high = minimum_filter1d(speed + error, size)[at]
-                steady &= highest_low <= (1 + BAND * drift_limit) * mean
-                steady &= lowest_high >= (1 - BAND * drift_limit) * mean
+                # The band that holds every speed is as wide as the drift that is allowed.
+                steady &= highest_low <= (1 + drift_limit / 2) * mean
+                steady &= lowest_high >= (1 - drift_limit / 2) * mean
         if steady.any():
             start = int(np.argmin(np.where(steady, worst, np.inf)))
             return (start, start + length - 1), ""

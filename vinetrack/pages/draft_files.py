@@ -42,18 +42,15 @@ def column_of(name: str, columns: Iterable[str]) -> str:
     return next((column for column in columns if quantity(column) == quantity(name)), name)
 
 
-_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
-
-
 def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
     """A cell of the column `name`, or with its own unit, in the unit of `column`; numbers get the decimal mark."""
     number, unit = value_and_unit(cell, name)
-    if not _NUMBER.fullmatch(number):
-        return cell
     unit, wanted, number = unit or split_unit(name)[1], split_unit(column)[1], number.replace(",", ".")
-    if unit != wanted:
-        number = f"{convert(float(number), unit, wanted):.6g}"
-    return number.replace(".", decimal)
+    try:
+        value = tables.parse_number(number)
+    except InputError:
+        return cell
+    return (number if unit == wanted else f"{convert(value, unit, wanted):.6g}").replace(".", decimal)
 
 
 # ------------------------------------------------------------------------------
@@ -437,13 +434,7 @@ _IN_NAMES = {
     "day": ("day", ""),
     "specimen": ("specimen tube", ""),
 }
-_LETTERS = {letter: name for name, (letters, _) in _IN_NAMES.items() for letter in letters.split()}
 _UNITS = {unit.lower(): name for name, (_, units) in _IN_NAMES.items() for unit in units.split()}
-
-_NUMBER_IN_NAME = r"\d+(?:[.p]\d+)?"
-_WORD = re.compile(rf"([a-z]*?)({_NUMBER_IN_NAME})([a-z]*)")
-# A number and its unit separated by a blank, `24 kPa`
-_SPACED_UNIT = re.compile(rf"(?<![a-z0-9])({_NUMBER_IN_NAME})[_\s]+({'|'.join(_UNITS)})(?![a-z0-9])")
 
 
 def list_pictures(folder: Path) -> list[str]:
@@ -513,12 +504,15 @@ def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
 def _cells_of_name(recording: str) -> dict[str, tuple[str, str]]:
     """The column, in whichever unit, and the cell of each quantity in a name; a file overrides its folders."""
     cells: dict[str, tuple[str, str]] = {}
+    of_letters = {letter: name for name, (letters, _) in _IN_NAMES.items() for letter in letters.split()}
+    number_form = r"\d+(?:[.p]\d+)?"
+    spaced_unit = rf"(?<![a-z0-9])({number_form})[_\s]+({'|'.join(_UNITS)})(?![a-z0-9])"  # such as `24 kPa`
     for part in (*PurePosixPath(recording).parts[:-1], _stem(recording)):
         of_part: dict[str, tuple[str, str]] = {}
-        for word in re.split(r"[_\s,;+-]+", _SPACED_UNIT.sub(r"\1\2", _in_ascii(part))):
-            if match := _WORD.fullmatch(word):
+        for word in re.split(r"[_\s,;+-]+", re.sub(spaced_unit, r"\1\2", _in_ascii(part))):
+            if match := re.fullmatch(rf"([a-z]*?)({number_form})([a-z]*)", word):
                 letters, number, unit = match.groups()
-                name = _LETTERS.get(letters, "") if letters else _UNITS.get(unit, "")
+                name = of_letters.get(letters, "") if letters else _UNITS.get(unit, "")
                 # In names of vines such as 12mm-100um-140mm the second length is that of the vine.
                 name = "length" if name == "diameter" and not letters and name in of_part else name
                 own = column_of(name, COLUMNS)

@@ -348,7 +348,7 @@ class Desk:
     """What the page asks of one folder, from several threads at a time."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.threads = folder, ThreadPoolExecutor(thread_name_prefix=THREAD_PREFIX)
         self._tracking, self._decoding = threading.Lock(), threading.Lock()
         self._decoded = lru_cache(2)(decoded_clip)  # of the current and the previous recording
         self._tracked: tuple[str, Tracking] | None = None  # the last that was tracked, in pixels
@@ -406,7 +406,6 @@ ANSWERS: dict[str, Callable[..., bytes | str | Mapping[str, Any] | None]] = {
     "POST track": Desk.track,
     "POST save": Desk.save,
 }
-EXECUTOR = ThreadPoolExecutor(thread_name_prefix=THREAD_PREFIX)
 
 
 class _Quiet(RequestHandler):
@@ -447,7 +446,9 @@ class _Answer(_Quiet):
         self.set_status(HTTPStatus.UNPROCESSABLE_ENTITY)
         content: bytes | str | Mapping[str, Any] | None
         try:
-            content = await IOLoop.current().run_in_executor(EXECUTOR, partial(ANSWERS[route], self.desk, **given))
+            content = await IOLoop.current().run_in_executor(
+                self.desk.threads, partial(ANSWERS[route], self.desk, **given)
+            )
             self.set_status(HTTPStatus.OK)
         except ExperimentError as error:
             content = {"problems": [_problem_json(problem) for problem in error.problems], "words": str(error)}
@@ -477,7 +478,7 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     desk, state = Desk(folder), page_state(folder)
     server = start_server(desk, port)
     # The tracker is compiled before the user needs it.
-    EXECUTOR.submit(desk.track, 0, **state)
+    desk.threads.submit(desk.track, 0, **state)
     server.run("Set-up", say, browser=browser)
 
 

@@ -67,10 +67,6 @@ DEPARTURES = (
     Departure("depletion_fast_slack", gamma=1.4, slack=True),
 )
 
-DEPARTURE_COLUMNS = (
-    "figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s",
-)  # fmt: skip
-
 
 def paper_trial(
     diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
@@ -96,7 +92,7 @@ def position_trials() -> list[Trial]:
 
 
 def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
-    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`."""
+    """Compute the differences of each departure from Eq. (2)."""
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
         plain = follow(trial, NONE, published.DAMPING_B[4])
@@ -112,7 +108,8 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
             off = [final_speed_m_s(trial, departure) - plain for trial, plain in zip(trials, plain_m_s, strict=True)]
             rms_m_s = math.sqrt(float(np.mean(np.square(off)))) if off else math.nan
             rows.append(("Fig. 5", float(pressure_kPa), departure.name, math.nan, rms_m_s, math.nan))
-    return pd.DataFrame(rows, columns=list(DEPARTURE_COLUMNS))
+    names = ("figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s")
+    return pd.DataFrame(rows, columns=list(names))
 
 
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:

@@ -14,7 +14,6 @@ from vinetrack.planning.predictive_inputs import (  # noqa: F401
 )
 from vinetrack.planning.predictive_inputs import PRINTED_EXPONENT as EXPONENT  # noqa: F401
 
-STEADY_CV = 0.03  # Largest coefficient of variation of speed in a steady window (published)
 CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)
 CHAMBER_L = 3.7  # Volume of the chamber, litres (published)
 LONGEST_VINE_MM = 280.0  # Length of the largest vine, 24 mm in diameter (published)

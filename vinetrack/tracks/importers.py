@@ -275,10 +275,6 @@ def _number(node: Element, name: str) -> float:
 # leaves open the sheet says: the rate by `capture_fps`, the length of a pixel or of any other unit by `mm_per_px`. A
 # note says what was taken for what, unless the names of the columns do.
 
-_COLUMN = re.compile(
-    r"#?\s*(?:(.+?)[\s_/]+)?(t|time|frame|x|y|z|position|likelihood)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE
-)
-
 
 def _column(cell: str) -> tuple[str, str, str]:
     """Point, quantity (t, frame, x, y, z, position, likelihood, or blank) and unit of a column.
@@ -286,7 +282,8 @@ def _column(cell: str) -> tuple[str, str, str]:
     >>> [_column(cell) for cell in ("x (cm)", "#t", "pt1_cam1_X", "ball/0/Y", "position_mm", "mass")]
     [('', 'x', 'cm'), ('', 't', ''), ('pt1_cam1', 'x', ''), ('ball/0', 'y', ''), ('', 'position', 'mm'), ('', '', '')]
     """
-    match = _COLUMN.fullmatch(cell.strip().strip('"').strip())
+    form = r"#?\s*(?:(.+?)[\s_/]+)?(t|time|frame|x|y|z|position|likelihood)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?"
+    match = re.fullmatch(form, cell.strip().strip('"').strip(), re.IGNORECASE)
     return (match[1] or "", match[2].lower().replace("time", "t"), match[3] or "") if match else ("", "", "")
 
 
@@ -515,11 +512,6 @@ def read_track(
     """Read positions measured elsewhere; the kind of file is recognised from its content: a table with `time_s,
     position_m[, sigma_m][, pressure_kPa]`, or of points of another program, or a Physics Tracker project (`.trk`).
     """
-    if path.suffix.lower() == ".trz":
-        raise InputError("is a packed Tracker project", "unpack it and name the .trk inside")
-    if path.suffix.lower() in (".nc", ".h5", ".hdf5"):
-        remedy = "export a CSV: save_as_csv=True in DeepLabCut, save_poses.to_dlc_file(ds, 'tip.csv') in movement"
-        raise InputError("is a netCDF or HDF5 file", remedy)
     text = read_text(path)
     if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
         return read_project(text, point_mass, frames_used)
