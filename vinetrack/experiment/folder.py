@@ -17,7 +17,7 @@ import numpy as np
 
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem, joined
-from vinetrack.core.records import Correction, Floats, Trial
+from vinetrack.core.records import Correction, Floats, Track, Trial
 from vinetrack.core.units import pressure_text
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, option, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
@@ -437,9 +437,10 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
 
 
 def check_experiment(
-    folder: Path | str, open_videos: Callable[[Experiment, list[Trial]], Iterable[Problem]] | None = None
-) -> list[Problem]:
-    """Find all problems of sheet, settings and tracks, and missing videos; this takes seconds."""
+    folder: Path | str, open_videos: Callable[[Experiment, list[Trial]], Iterable[Problem]] | None = None,
+    tracks: list[tuple[Trial, Track]] | None = None,
+) -> list[Problem]:  # fmt: skip
+    """Find all problems of sheet, settings and tracks, and missing videos; `tracks` gets the tracks that are read."""
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError as error:
@@ -454,7 +455,7 @@ def check_experiment(
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}
     for trial in experiment.trials:
-        found = _check_video(trial.video, named_videos) if trial.video else _check_track(trial)
+        found = _check_video(trial.video, named_videos) if trial.video else _check_track(trial, tracks)
         of_trials += [replace(problem, trial=trial.name) for problem in found]
         readable += [trial] if trial.video and not found else []
     if readable and open_videos is not None:
@@ -466,13 +467,15 @@ def check_experiment(
     return problems
 
 
-def _check_track(trial: Trial) -> list[Problem]:
-    """Read a track with its pressure, and warn where it contradicts the sheet."""
+def _check_track(trial: Trial, tracks: list[tuple[Trial, Track]] | None) -> list[Problem]:
+    """Read a track with its pressure, add it to `tracks`, and warn where it contradicts the sheet."""
     place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
     try:
         track = load_track(trial)
     except InputError as error:
         return [Problem.from_error(error, SHEET, **place)]
+    if tracks is not None:
+        tracks.append((trial, track))
     remarks = {}
     step_s = float(np.median(np.diff(track.time_s)))
     if step_s > 0.2:  # no camera that films a growth takes so few pictures (chosen)

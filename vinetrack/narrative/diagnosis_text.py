@@ -83,12 +83,8 @@ def power_lines(power: Power) -> list[str]:
     lines += [f"95 % intervals: {', '.join(widths)}."] if widths else []
     for plan in power.further:
         lines += ["", *further_lines(plan)]
-    return lines + simulated_lines(power)
-
-
-def simulated_lines(power: Power) -> list[str]:
-    """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
-    lines = []
+    # The rates of simulated campaigns beside those of linear theory
+    lines += ["Simulated campaigns, each diagnosed in full:"] if power.simulated else []
     for rates in power.simulated:
         facts = {name: getattr(rates, name) for name in ("count", "campaigns", "promised", "failed")}
         facts |= {
@@ -99,7 +95,7 @@ def simulated_lines(power: Power) -> list[str]:
             entry = power[rates.effect]
             facts["what"] = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"
         lines.append(f"  {sentence('simulated_effect' if rates.effect else 'simulated_null', facts)}")
-    return ["Simulated campaigns, each diagnosed in full:", *lines] if lines else []
+    return lines
 
 
 def further_lines(plan: FurtherTrials) -> list[str]:
@@ -296,12 +292,6 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
     return lines + [f"! {message}" for message in (*against, *after.messages)]
 
 
-def _newtons(amplitude_N: float, sigma_N: float) -> str:
-    """Return a force with its sign and standard error."""
-    error = with_error(amplitude_N, sigma_N) if math.isfinite(sigma_N) else number(amplitude_N)
-    return f"{'+' if amplitude_N > 0 else ''}{error} N".replace("-", "−")
-
-
 # ------------------------------------------------------------------------------
 # Where a model fails, what drifts, and the force that it lacks.
 
@@ -459,7 +449,7 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "condition": lambda condition: _condition_text(**condition),
     "off": lambda off_m: f"{with_error(*(1e3 * abs(m) for m in off_m))} mm",
     "variables": _variables_text,
-    "newtons": lambda force_N: _newtons(*force_N),
+    "newtons": lambda force_N: f"{'+' if force_N[0] > 0 else ''}{with_error(*force_N)} N".replace("-", "−"),
     "place": lambda y_over_L: "" if y_over_L == 1 else f" at y/L = {y_over_L:g}",
     "draws": lambda share: "in every draw" if share > 0.995 else f"in {share:.0%} of the draws",
     "spaced": lambda name: name.replace("_", " "),

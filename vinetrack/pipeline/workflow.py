@@ -20,13 +20,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError, format_problems, remark
+from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems, remark
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import waiting
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
 from vinetrack.results.folder_layout import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
+    from vinetrack.core.records import Track, Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.survey import Keep
@@ -245,22 +246,19 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.inference.fit_data import not_measured
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
-    from vinetrack.tracks.importers import load_track, track_lines
+    from vinetrack.tracks.importers import track_lines
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
     from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
     surveyor = Surveyor(keep)
-    problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor)]
+    tracks: list[tuple[Trial, Track]] = []
+    problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor, tracks)]
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
     problems += [*in_no_row(experiment), *model_problems(experiment)]
-    entries, tracks = list(surveyor.facts.values()), []
-    for trial in experiment.trials:
-        if trial.track is not None:
-            with contextlib.suppress(InputError):
-                tracks.append((trial, load_track(trial)))
+    entries = list(surveyor.facts.values())
     problems += [
         Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
         for name, why in not_measured(tracks).items()

@@ -151,6 +151,13 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     columns = ["Effect", "number", *["at most"][: len(limits)], *POWER_COLUMNS[2:]]
     if limits:
         sizes = [(*row[:2], limits.get(row[:2], "–"), *row[2:]) for row in sizes]
+    tied = [  # candidates with nearly proportional effects on the trajectories, from a cosine of 0.95 on (chosen)
+        (abs(value), f"{spaced_name(entry.cosines.effects[j])} and {spaced_name(entry.cosines.effects[i])}")
+        for entry in diagnosis.rounds[:1]
+        for i, row in enumerate(entry.cosines.matrix)
+        for j, value in enumerate(row[:i])
+        if is_finite(value) and abs(value) >= 0.95
+    ]
     badge = diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed"
     return {
         "badge": "check the sheet" if diagnosis.contradicted_columns else badge,
@@ -162,7 +169,7 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
         "rounds": rounds,
         "hidden": hidden,
         "power": power and {"sentences": told, "sizes": sizes, "columns": columns},
-        "tied": tied_pairs(diagnosis),
+        "tied": "; ".join(f"{text} (cosine {number(value)})" for value, text in sorted(tied, reverse=True)[:3]),
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
     }
@@ -184,18 +191,6 @@ def upper_limits(
                 shown, factor = display_unit(unit, pressure_unit)
                 limits[spaced_name(row.effect), symbol] = f"{number(factor * largest)} {shown}".strip()
     return limits
-
-
-def tied_pairs(diagnosis: Diagnosis) -> str:
-    """Return the pairs of candidates with nearly proportional effects on the trajectories, three of largest cosine."""
-    pairs = [
-        (abs(value), f"{spaced_name(entry.cosines.effects[j])} and {spaced_name(entry.cosines.effects[i])}")
-        for entry in diagnosis.rounds[:1]
-        for i, row in enumerate(entry.cosines.matrix)
-        for j, value in enumerate(row[:i])
-        if is_finite(value) and abs(value) >= 0.95  # above it two candidates count as tied (chosen)
-    ]
-    return "; ".join(f"{text} (cosine {number(value)})" for value, text in sorted(pairs, reverse=True)[:3])
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
