@@ -244,11 +244,7 @@ def test_the_fast_vine_in_a_table_with_units_in_files_and_from_python(tmp_path):
 
     assert files[0].read_bytes().startswith(b"\x89PNG")
     table = pd.read_csv(files[1])
-    assert list(table.columns) == [
-        *("condition", "y_over_L", "lead_position_m", "time_s", "time_low_90_s", "time_high_90_s"),
-        *("lead_velocity_m_s", "lead_velocity_low_90_m_s", "lead_velocity_high_90_m_s", "tail_velocity_m_s"),
-        *("tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa"),
-    ]
+    assert {"condition", "y_over_L", "lead_position_m", "tension_N", "pressure_kPa"} < {*table.columns}
     assert (table["time_low_90_s"] <= table["time_s"]).all()
     assert (table["lead_velocity_m_s"] * 2).to_numpy() == pytest.approx(table["tail_velocity_m_s"].to_numpy())
     (entry,) = json.loads(files[2].read_text())

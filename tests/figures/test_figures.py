@@ -14,7 +14,7 @@ from vinetrack.core.records import Track
 from vinetrack.figures import damping_figures, motion_figures
 from vinetrack.figures import diagnosis_figures as figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
-from vinetrack.figures.motion_figures import TRACKED, draw_strip
+from vinetrack.figures.motion_figures import TRACKED, ClipView, draw_strip
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, SKY, VERMILLION, look, render
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
@@ -114,9 +114,7 @@ def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge():
     track = kinematics.assign(flag=np.where(time_s == 0.007, "rejected", ""))
     kinematics = kinematics.assign(lead_velocity_m_s=1.0, lead_velocity_sigma_m_s=0.02)
     found = {"x_ss_m_s": 2.0, "x_ss_sigma_m_s": 0.01, "from_s": 0.05, "to_s": 0.15}
-    windows = [
-        {"rule": rule, "accepted": rule == "gated", **found} for rule in ("gated", "quasi_steady", "paper", "user")
-    ]
+    windows = [{"rule": of, "accepted": of == "gated", **found} for of in ("gated", "quasi_steady", "paper", "user")]
     title = "W" * 60 + " · 24 mm × 200 µm × 280 mm · 28 kPa · 35.6 g"
     figure = motion_figures.draw_trial_motion(title, track, kinematics, pd.DataFrame(windows))
     level = next(line for line in figure.axes[0].lines if to_hex(line.get_color()) == BLUE.lower())
@@ -184,8 +182,7 @@ EDGES = [
     ids=["along", "larger", "down"],
 )
 def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(axis, size, width_px):
-    view = motion_figures.ClipView("a", axis, EDGES, 40.0, size, 0.25, 30.0, width_px)
-    grey = np.full(size[::-1], 90, np.uint8)
+    view, grey = ClipView("a", axis, EDGES, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
     zoom = width_px / size[0]
     unseen, picture = (motion_figures.compose(view, grey, frame, 12.0)[-round(zoom * size[1]) :] for frame in (0, 1))
     assert picture.shape[1] == width_px

