@@ -24,7 +24,7 @@ def test_what_the_chamber_the_injector_and_the_sizes_say():
     The injector: 2.5² × 12.5 over 15² × 20: 1/57.6 = 1.736 %; 149.325 × (1 − 1/1.017361) = 2.5482 kPa of 48.
     """
     assert motions.volume_change(3.7e-3, 24.0, 280.0) == pytest.approx(0.126669 / 3.7, rel=1e-5)
-    ours = lines.as_table(lines.computed_rows()).set_index("row")["ours"]
+    ours = pd.DataFrame(lines.computed_rows()).set_index("row")["ours"]
     assert ours["chamber_volume_change"] == pytest.approx(3.42, abs=0.005)
     for pressure_kPa, slow, fast in ((28, 15, 21), (14, 27, 38), (7, 51, 71)):
         assert ours[f"gauge_drop_{pressure_kPa}kPa_slow"] == pytest.approx(slow, abs=0.5)
@@ -233,7 +233,7 @@ def nothing() -> dict:
 
 
 def table_rows(of: dict) -> pd.DataFrame:
-    return lines.as_table(lines.result_rows(**of)).set_index("row")
+    return pd.DataFrame(lines.result_rows(**of)).set_index("row")
 
 
 def test_what_an_experiment_found_stands_beside_what_is_printed():
@@ -283,7 +283,7 @@ EVERY_NUMBER = {
 def test_no_published_number_is_without_its_line():
     steady = pd.DataFrame(columns=["trial", "rule", "accepted", "points", "cv", "drift"]).astype({"accepted": bool})
     rows = [*lines.protocol_rows([], steady, lines.SIMULATED), *lines.result_rows(**nothing())]
-    whole = lines.as_table([*rows, *lines.computed_rows(), *lines.theory_rows([])])
+    whole = pd.DataFrame([*rows, *lines.computed_rows(), *lines.theory_rows([])])
     assert list(whole.columns)[:6] == ["row", "where", "quantity", "setting", "unit", "published"]
     by_row = whole.set_index("row")
     for row, value in EVERY_NUMBER.items():

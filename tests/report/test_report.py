@@ -22,7 +22,7 @@ from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.paper.rows import SIMULATED, as_table
+from vinetrack.paper.rows import SIMULATED
 from vinetrack.report import build
 from vinetrack.report.clips import write_clip
 
@@ -230,7 +230,7 @@ def paper() -> dict:
     """A number of the paper beside ours."""
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
-    return build.paper_section(as_table([row]).assign(ours_low_95=np.nan, ours_high_95=np.nan), [])
+    return build.paper_section(pd.DataFrame([row]).assign(ours_low_95=np.nan, ours_high_95=np.nan), [])
 
 
 def power(wary: str = "") -> Power:

@@ -35,7 +35,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results import folder_layout
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
-from vinetrack.tracks.importers import flag_end_of_motion
+from vinetrack.tracks.importers import flag_end_of_motion, table_track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -216,12 +216,13 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
     >>> f"{trial.name}: {1e3 * trial.diameter_m:g} mm, {track.time_s.size} points"
     'P24_1: 24 mm, 224 points'
     """
-    position = next((name for name in POSITION_COLUMNS if name in frame), "lead_position_m")
-    if absent := [name for name in ("trial", "time_s", position) if name not in frame]:
+    position = next((name for name in (*POSITION_COLUMNS, "x", "y") if name in frame), "")
+    needed = ("trial",) if position in ("x", "y") else ("trial", "time_s", position or "lead_position_m")
+    if absent := [name for name in needed if name not in frame]:
         remedy = "a frame of tracks has trial, time_s, lead_position_m and the columns of a trial sheet"
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = {str(name): part for name, part in frame.groupby("trial", sort=False)}
-    cells = [_cells(name, part) for name, part in parts.items()]
+    cells = [_cells(name, part, position) for name, part in parts.items()]
     table, _ = in_sheet_units(experiments.table_of_texts(cells), "the frame")
     made = experiments.planned_rows(
         table, ExperimentSettings(), experiments.REQUIRED_FOR_PREDICTION, file=Path("the frame"), measured=True
@@ -229,13 +230,13 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
     return [(trial, _track(trial, parts[trial.name], position)) for trial in made.trials]
 
 
-def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
+def _cells(name: str, part: pd.DataFrame, position: str) -> dict[str, str]:
     """Return the cells that a trial sheet would have for a trial: all columns but those of the track, as text."""
     cells = {"trial": name}
     of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
     for column in part.columns:
         first, varies = part[column].iloc[0], len(part[column].unique()) > 1
-        if column in of_track or pd.isna(first) or first == "":
+        if column in of_track or pd.isna(first) or first == "" or (varies and position in ("x", "y")):
             continue
         if column != "pressure_kPa" and varies:
             message, remedy = f"changes within the trial {name}", "give it one value in all rows of the trial"
@@ -245,6 +246,8 @@ def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
 
 
 def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
+    if position in ("x", "y"):
+        return flag_end_of_motion(trial, table_track(part.to_csv(index=False), "", trial.capture_fps, trial.m_per_px))
     known = {name: part[name].to_numpy(dtype=float) for name in ERROR_COLUMNS if name in part}
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1

@@ -76,8 +76,7 @@ class TrialMotion:
 
 def find_release(track: Track, kinematics: Kinematics) -> Release:
     """Find the resting position of the leading edge and the time of its release."""
-    usable = track.usable
-    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    time_s, position_m = _points(track)
     n_rest = rest_points(position_m)
     span_m = float(np.ptp(kinematics.lead_position_m))
     # 5.0: standard deviations of a position by which the track must leave its start to count as moving

@@ -46,7 +46,7 @@ Row = dict[str, Any]
 
 
 # ------------------------------------------------------------------------------
-# One row, and the table.
+# One row of the table.
 
 
 @lru_cache
@@ -86,15 +86,6 @@ def row_of(
         "how": "the trials of this experiment do not tell" if unanswered else how.format(**facts),
         "beside": beside,
     }
-
-
-def as_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """Return the rows as the table `paper.csv`."""
-    table = pd.DataFrame(rows)
-    twice = table.loc[table["row"].duplicated(), "row"].tolist()
-    if twice:
-        raise ValueError(f"rows stand twice: {', '.join(twice)}")
-    return table
 
 
 # ------------------------------------------------------------------------------
@@ -156,7 +147,7 @@ def paper_tables(
     files |= {name: tables[f"paper_{name}"] for name in ("positions", "speeds", "departures")}
     of_results = result_rows(mark, fit, **files)
     rows = [*protocol_rows(trials, steady, mark), *of_results, *computed_rows(), *theory_rows(trials)]
-    return tables | {"paper": as_table(rows)}
+    return tables | {"paper": pd.DataFrame(rows)}
 
 
 def result_rows(

@@ -163,8 +163,14 @@ def track_file(
     """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
     given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns the facts as lines and as JSON.
     """
-    settings, folder = _settings_of(calibration, mm_per_px)
-    scaled = math.isfinite(mm_per_px) or calibration is not None
+    scaled, settings = math.isfinite(mm_per_px) or calibration is not None, ExperimentSettings()
+    if calibration is not None:
+        if math.isfinite(mm_per_px):
+            raise UserError("--mm-per-px and --calibration are two scales: give one")
+        file = calibration / "experiment.yaml" if calibration.is_dir() else calibration
+        settings = ExperimentSettings(calibration=read_experiment_settings(file).calibration)
+        if settings.calibration is None:
+            raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
     try:
         recording = inspect_recording(path)
         rate = capture_fps if recording.capture_fps is None else recording.capture_fps
@@ -182,7 +188,7 @@ def track_file(
             axis=axis,
             frames_used=frames_used,
         )
-        measured = measure_recording(trial, settings, folder)
+        measured = measure_recording(trial, settings, file.parent if calibration else Path())
     except RecordingError as error:
         raise UserError(str(error)) from None
     if not math.isfinite(rate):
@@ -198,16 +204,3 @@ def track_file(
     lines += [] if math.isfinite(rate) else ["Capture rate unknown: without --capture-fps there are no times."]
     lines += [f"warning: {note}" for note in facts["notes"]]
     return [*lines, "Written: " + ", ".join(map(str, written.values()))], facts | {"written": written}
-
-
-def _settings_of(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
-    """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
-    if file is None:
-        return ExperimentSettings(), Path()
-    if math.isfinite(mm_per_px):
-        raise UserError("--mm-per-px and --calibration are two scales: give one")
-    file = file / "experiment.yaml" if file.is_dir() else file
-    calibration = read_experiment_settings(file).calibration
-    if calibration is None:
-        raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
-    return ExperimentSettings(calibration=calibration), file.parent

@@ -80,7 +80,7 @@ def drawn_final_speeds(
 
 
 TIME = "time to get there"
-EDGE, TAIL = "speed of the leading edge", "speed of the tail"
+EDGE = "speed of the leading edge"
 EJECTION = "ejection speed of the payload"
 TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
 
@@ -260,7 +260,7 @@ def predict_vine(
             tell(EJECTION, 1.0, np.where(np.isfinite(end_s), ejected_m_s, 0.0), "m/s")
         tell("time to the end", 1.0, end_s, "s")
     tell(EDGE, at_fraction, lead_m_s[:, place], "m/s")
-    tell(TAIL, at_fraction, r * lead_m_s[:, place], "m/s")
+    tell("speed of the tail", at_fraction, r * lead_m_s[:, place], "m/s")
     tell(TIME, at_fraction, time_s[:, place], "s")
     if DAMPING in model.parameter_names:
         # Of (P − P_y)A = B ẋⁿ, without weight or further effects

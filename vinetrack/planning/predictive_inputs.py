@@ -272,29 +272,25 @@ class FitNumbers:
     @cached_property
     def covariance(self) -> Floats:
         """Covariance of the parameters, of ln B in place of B; 0 where the fit does not determine one. It is widened
-        where the 95 % interval is wider than a normal one's.
+        where the 95 % interval is wider than a normal one's, unless a bound determines it.
         """
         covariance = self.fit.covariance
         scale = np.zeros(len(self.fit.numbers))
-        for k, fitted in enumerate(self.fit.numbers):
-            if math.isfinite(self.fit.covariance[k, k]):
-                scale[k] = _widening(fitted) / (fitted.value if _is_log(fitted) else 1.0)
+        for k, one in enumerate(self.fit.numbers):
+            if math.isfinite(covariance[k, k]):
+                log, low, high = _is_log(one), one.low, one.high
+                unit, widening = one.value if log else 1.0, 1.0
+                if one.method == "linear" and one.sigma > 0 and low < high and (low > 0 or not log):
+                    half = (math.log(high / low) if log else high - low) / 2
+                    # 1.96: a normal distribution's 95 % interval is so many standard deviations to either side
+                    widening = max(half / (1.959963984540054 * (one.sigma / unit)), 1.0)
+                scale[k] = widening / unit
         return np.asarray(np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale)
 
 
 def _is_log(number: Number) -> bool:
     """Whether a parameter varies as its logarithm: B, as in the fit."""
     return number.key == DAMPING and number.value > 0
-
-
-def _widening(number: Number) -> float:
-    """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
-    low, high, sigma, log = number.low, number.high, number.sigma, _is_log(number)
-    if number.method != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
-        return 1.0
-    half = (math.log(high / low) if log else high - low) / 2
-    # 1.96: of a normal distribution, whose 95 % interval is this many standard deviations to either side
-    return max(half / (1.959963984540054 * (sigma / number.value if log else sigma)), 1.0)
 
 
 def _alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
