@@ -117,13 +117,11 @@ WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows,
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
-    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track."""
+    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track, two or more,
+    whose times increase.
+    """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
-    if time_s.size < 2:
-        raise ValueError(f"the track has {time_s.size} usable points; a velocity needs at least 2")
-    if np.any(np.diff(time_s) <= 0):
-        raise ValueError("the times of the track do not increase; sort its rows or drop repeated ones")
     noise_m, rho = position_noise(time_s, position_m)
     origin_m = float(position_m[0])
     values, sigma, widths = smooth(time_s, position_m - origin_m, noise_m, rho, order=order, kappa=kappa)

@@ -74,8 +74,7 @@ def inline_picture(picture: str | bytes | None, prefix: str, description: str) -
 def _inline_svg(svg: str, prefix: str, label: str) -> str:
     """An SVG of matplotlib with its colours from the page, so that it follows a dark scheme, and unique identifiers."""
     found = re.search(r'<svg[^>]* viewBox="0 0 ([\d.]+) ([\d.]+)"[^>]*>(.*)</svg>', svg, re.DOTALL)
-    if found is None:
-        raise ValueError("not an SVG file of a figure")
+    assert found is not None
     width, height = float(found[1]), float(found[2])
     colours = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
     body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", found[3], flags=re.DOTALL)
