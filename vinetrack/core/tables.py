@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
+from statistics import mode
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -80,9 +81,9 @@ _AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # Such 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank or if the line is
-    short); `lines[i]` is its line in the file, from 1; `extra[i]` holds the cells beyond the last column; `nameless`: a
-    column without a name has content; `units`: of the columns that were converted from another unit.
+    """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank, or if the line is
+    short); `lines[i]` is its line in the file, from 1; `extra[i]`: cells beyond the last column, blank ones only where
+    most rows have none; `nameless`: a column without a name has content; `units`: of columns in another unit.
     """
 
     columns: tuple[str, ...]
@@ -160,9 +161,8 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         # The separator that splits the header into most cells; headers contain no decimal commas.
         header = re.sub(r'"[^"]*"', "", next((line for line in lines if line.strip()), ""))
         delimiter = max("\t;,", key=header.count) if re.search("[\t;,]", header) else ","
-    reader = csv.reader(
-        io.StringIO("\n".join(lines), newline=""), delimiter=delimiter, skipinitialspace=True, strict=True
-    )
+    content = io.StringIO("\n".join(lines), newline="")
+    reader = csv.reader(content, delimiter=delimiter, skipinitialspace=True, strict=True)
     records, start = [], 1
     try:
         for read in reader:
@@ -177,12 +177,13 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
     named, width = tuple(filter(None, columns)), len(columns)
     if repeated := sorted({column for column in named if named.count(column) > 1}):
         raise InputError(f"names the column {repeated[0]!r} twice", "keep one of them")
+    usual = mode([width, *(len(cells) for _, cells in body)])
     pairs = [list(zip_longest(columns, cells[:width], fillvalue="")) for _, cells in body]
     return Table(
         columns=named,
         rows=tuple({name: cell for name, cell in row if name} for row in pairs),
         lines=tuple(line + skip_lines for line, _ in body),
-        extra=tuple(tuple(filter(None, cells[width:])) for _, cells in body),
+        extra=tuple(tuple(cells[width:]) if len(cells) > usual or any(cells[width:]) else () for _, cells in body),
         delimiter=delimiter,
         decimal=_find_decimal([cell for _, cells in body for cell in cells], delimiter),
         nameless=any(cell and not name for row in pairs for name, cell in row),
@@ -195,8 +196,7 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
         return "."
     numbers = [cell for cell in cells if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell)]
     clear = [cell for cell in numbers if not _AMBIGUOUS_NUMBER.fullmatch(cell)]
-    counted = numbers if not clear and delimiter == ";" else clear
-    marks = {"," if "," in cell else "." for cell in counted}
+    marks = {"," if "," in cell else "." for cell in clear or (numbers if delimiter == ";" else ())}
     return "" if len(marks) == 2 else marks.pop() if marks else "."
 
 

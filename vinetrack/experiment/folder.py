@@ -141,7 +141,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     may_be_blank = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
     blank = {column: tuple(row.name for row in vines if column not in row.given) for column in may_be_blank}
     partly = [name for name, names in blank.items() if COLUMNS[name].if_blank and len(names) < len(vines)]
-    for row in vines:
+    for row in vines if settings else ():
         row.add_blank(partly, "others have a value, so fill it in, 0 as well", "warning")
     for row in in_use:
         if sheet_is_sound and not row.faulty:

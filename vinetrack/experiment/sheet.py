@@ -167,8 +167,8 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         except InputError as error:
             row.add_error(error, name, typed)
     if table.extra[index]:
-        message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
-        row.add("more_cells", message, remedy="put text that contains separators, and decimal commas, in quotes")
+        remedy = "put text that contains separators, and decimal commas, in quotes, or remove separators at its end"
+        row.add("more_cells", f"has {len(table.extra[index])} cells more than the header", remedy=remedy)
     if not row.in_use:
         row.problems = [replace(problem, severity="warning") for problem in row.problems]
     return row
@@ -183,7 +183,11 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
     warning = partial(Problem, file=path.name, severity="warning")
     message = "is not a column of the trial sheet and is ignored"
     left = [column for column in COLUMNS if column not in table.columns]
-    unknown = [name for name in table.columns if name not in COLUMNS]
+    told = {problem.column for problem in problems}  # of the same quantity in two units one is ignored
+    unknown = [name for name in table.columns if name not in COLUMNS and name not in told]
+    if table.columns and len(unknown) == len(table.columns):
+        remedy = "name them as vinetrack settings does, and delete what stands above their names"
+        raise ExperimentError([Problem("no_columns", "names no known column", file=path.name, line=1, remedy=remedy)])
     problems += [warning("unknown_column", message, name, line=1, remedy=did_you_mean(name, left)) for name in unknown]
     if table.nameless:
         problems.append(warning("nameless_column", "has a column without a name, which is ignored"))
