@@ -65,8 +65,7 @@ def test_a_diagnosis_comes_back_as_it_was_written_and_a_refused_one_has_no_verdi
         assert {key: again[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
     write_json(Results(tmp_path).diagnosis, refused("no trial moves"))
     back = read_diagnosis(Results(tmp_path))
-    assert back is not None
-    assert (back.verdict, back.final_verdict, back.refused) == ("", "", "no trial moves")
+    assert (back and (back.verdict, back.final_verdict, back.refused)) == ("", "", "no trial moves")
 
 
 # What a diagnosis left in a results folder, read back for pictures and page: whole, in parts, and not there.
@@ -75,7 +74,9 @@ TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
 
 
 def conditions() -> pd.DataFrame:
-    labels = {"slow": "12 mm, 24 kPa", "fast": "12 mm, 60 kPa"}
+    alike = Trial(name="a", diameter_m=0.012, pressure_Pa=24e3, payload_kg=0.0)  # but for what only their names say
+    labels = drawn.condition_labels({"12mm_0deg": alike, "12mm_90deg": alike})
+    labels = dict(zip(("slow", "fast"), labels.values(), strict=True))
     rows = [(trial, "v", condition, labels[condition]) for trial, condition in TRIALS.items()]
     return pd.DataFrame(rows, columns=["trial", "vine", "condition", "condition_label"])
 
@@ -128,10 +129,10 @@ def test_predictions_count_from_release_and_origin(tmp_path):
 def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_their_errors(tmp_path):
     found = tables_of(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
-    assert found.worst == "12 mm, 24 kPa"
+    assert found.worst == "12 mm, 24 kPa, 0deg"
     assert set(found.before_after["trial"]) == {"a", "b"}
     assert drawn.worst_condition(found.before_after.iloc[:0]) == ""
-    assert set(found.where["condition_label"]) == {"12 mm, 24 kPa", "12 mm, 60 kPa"}
+    assert set(found.where["condition_label"]) == {"12 mm, 24 kPa, 0deg", "12 mm, 24 kPa, 90deg"}
     slow = found.where[found.where["condition"] == "slow"]
     assert slow[["growth_from", "growth_to"]].to_numpy().tolist() == [[0.0, 0.5], [0.5, 1.0]]
     assert slow[["misfit_m", "scatter_m", "n_trials"]].to_numpy().tolist() == [[0.011, 0.001, 2]] * 2

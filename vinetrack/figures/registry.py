@@ -165,18 +165,25 @@ class FigureTables:
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
     """Add pressure and a short label of the condition to `trials.csv`."""
-    by_name = {trial.name: trial for trial in known}
+    by_name, label_of = {trial.name: trial for trial in known}, condition_labels({t.condition: t for t in known})
     labels, pressures = [], []
     for name, condition in zip(trials["trial"], trials["condition"], strict=True):
         trial = by_name.get(str(name))
-        labels.append(condition_label(trial) if trial else str(condition) or "not readable")
+        labels.append(label_of[trial.condition] if trial else str(condition) or "not readable")
         pressures.append(1e-3 * trial.pressure_Pa if trial else float("nan"))
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
 
 
-def condition_label(trial: Trial) -> str:
-    """Return a short label of a trial's condition: diameter, pressure and payload."""
-    return ", ".join([f"{1e3 * trial.diameter_m:g} mm", *features(trial)[1:]])
+def condition_labels(examples: Mapping[str, Trial]) -> dict[str, str]:
+    """Short labels of conditions, by name with a trial of each: diameter, pressure, payload, and where others have the
+    same what differs in their names.
+    """
+    labels = {name: ", ".join([f"{1e3 * t.diameter_m:g} mm", *features(t)[1:]]) for name, t in examples.items()}
+    same = {label: [name.split("_") for name in labels if labels[name] == label] for label in labels.values()}
+    return {
+        name: ", ".join([label, *(part for part in name.split("_") if any(part not in parts for parts in same[label]))])
+        for name, label in labels.items()
+    }
 
 
 def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:

@@ -21,7 +21,7 @@ from vinetrack.diagnosis.ladder import rms_of
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.folder import Experiment
-from vinetrack.figures.registry import condition_label
+from vinetrack.figures.registry import condition_labels
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
@@ -108,10 +108,8 @@ class Campaign:
 
     @cached_property
     def labels(self) -> Mapping[str, str]:
-        """The label of every condition in the figures, with its name where two have the same."""
-        labels = {name: condition_label(trial) for name, trial in self.examples.items()}
-        shown = list(labels.values())
-        return {name: label if shown.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
+        """The label of every condition in the figures."""
+        return condition_labels(self.examples)
 
     @cached_property
     def host(self) -> Model:
