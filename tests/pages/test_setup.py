@@ -145,7 +145,7 @@ def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_the
 
 
 def test_sentences_above_the_table_of_notes_are_left_out_and_short_headings_known():
-    prose = "bench, sat 28 nov\nno payload yet, pressure from the big regulator\n"
+    prose = "bench, sat 28 nov, level but for d15_24kPa_1 (down)\nno payload yet, pressure from the big regulator\n"
     table = "clip    psi   payload_g\nd99_1   9    1\nlate   5.3   5\nd15_24kPa_1   3.5  0\nd15_30kPa_1   4.5   20"
     for text in (prose + table, prose + re.sub(" {2,}", "\t", table), prose + table.replace("psi", "P (psi)")):
         assert changed(text) == EXPECTED

@@ -320,10 +320,13 @@ def place_block(
         inside = (known for known in words if len(known) > 2 and f"_{known}_" in f"_{plain}_")
         return words.get(plain) or words.get(max(inside, key=len, default=""), "")
 
-    # Notes may have sentences above their table, which begins with its header or the line of the first recording.
+    # Notes may have sentences above their table, which begins with its header or the line of the first recording: with
+    # its name in a cell, for a sentence may have one too.
     lines = [line for line in text.splitlines() if line.strip()]
-    named = (i for i, line in enumerate(lines) if any(f"_{name}_" in f"_{_plain(line)}_" for name in row_named))
-    table = next(named, 0)
+    named = [i for i, line in enumerate(lines) if any(f"_{name}_" in f"_{_plain(line)}_" for name in row_named)]
+    cells_from = ((i, read_block("\n".join(lines[i:]))[0]) for i in named)
+    in_cell = (i for i, cells in cells_from if any(_plain(cell) in row_named for cell in cells))
+    table = next(in_cell, min(named, default=0))
     known = [sum(bool(column_named(word)) for word in re.split(r"[\s,;|]+", line)) for line in lines[:table]]
     # A header is the last line with two known words at least: a sentence above it may have more.
     table = max((i for i, count in enumerate(known) if count > 1), default=table)
@@ -337,7 +340,7 @@ def place_block(
             film = words["thickness"]
             header = [film if word.lower() == "film" else name for word, name in zip(first, header, strict=True)]
         unknown = [word for word, name in zip(first, header, strict=True) if word and not name]
-        notes += [f"No column is named “{word}”: left out; {did_you_mean(word, COLUMNS)}." for word in unknown]
+        notes += [f"No column is named “{word}”: left out; {did_you_mean(word, COLUMNS)}" for word in unknown]
         block = block[1:]
         name_place = header.index("trial") if "trial" in header else None
     else:
@@ -387,7 +390,7 @@ def _header_words(columns: Sequence[str]) -> dict[str, str]:
     for name in (*COLUMNS, *columns):
         words |= {written.lower(): written for written in (*other_units(name), name)} | {quantity(name).lower(): name}
     short = {"film": "thickness", "wall": "thickness", "p": "pressure", "dia": "diameter", "l": "length"}
-    short |= {"load": "payload"}
+    short |= {"d": "diameter", "load": "payload"}
     words |= {
         word.replace(name, other, 1): column
         for other, name in short.items()
