@@ -442,10 +442,11 @@ class FilmPanel:
             self.caption.text = f"<p>{escape(reason)}</p>"
             return
         height, width = film.picture(0).shape
-        self.figure.x_range.update(start=-0.5, end=width - 0.5)
+        shown = max(width, 1.5 * height)  # 1.5: a picture on end stays within the window (chosen)
+        self.figure.x_range.update(start=(width - shown) / 2 - 0.5, end=(width + shown) / 2 - 0.5)
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
         self._image.glyph.update(dw=width, dh=height)
-        self.figure.aspect_ratio = width / height
+        self.figure.aspect_ratio = shown / height
         self.figure.visible = self.frame.visible = True
         known = np.flatnonzero(view.track["edge_px"].notna())
         last = len(film.frames) - 1
