@@ -251,7 +251,7 @@ def words(html: str) -> str:
 
 def test_the_words_of_whole_pages_are_the_stored_ones():
     figures = [build.ReportFigure(k, k, "c", SVG, f"{k}.csv", "a\n1\n") for k in figures_of(*SECTIONS[2:-1])]
-    whole = replace(read(diagnosis("missing")), ladder=ladder("", "reservoir_depletion"))
+    whole = replace(read(diagnosis("missing")), ladder=ladder("", "reservoir_depletion"), power=power())
     more = {"sections": [paper()]} | recordings("a") | result()
     adequate = read(diagnosis("adequate"))
     limited = Candidate.from_json(candidate("air_drag", 1.0, largest={"k": 2500.0}))
