@@ -77,7 +77,7 @@ def frames_to_show(track: pd.DataFrame) -> range:
     edge = track["edge_px"].to_numpy(dtype=float)
     tracked = np.flatnonzero(np.isfinite(edge))
     if tracked.size < FEWEST_POINTS:
-        raise ResultsError("its edge was not found, so there is nothing to draw")
+        raise ResultsError("its edge was not found, so there is nothing to draw: trials.csv has the reason")
     low, high = float(np.nanmin(edge)), float(np.nanmax(edge))
     start = tracked[edge[tracked] > low + 0.01 * (high - low)][0]
     end = tracked[edge[tracked] < high - 0.002 * (high - low)][-1]
