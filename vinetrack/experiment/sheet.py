@@ -185,7 +185,7 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
     left = [column for column in COLUMNS if column not in table.columns]
     told = {problem.column for problem in problems}  # of the same quantity in two units one is ignored
     unknown = [name for name in table.columns if name not in COLUMNS and name not in told]
-    if not any(difflib.get_close_matches(name, COLUMNS, 1, CLOSE_NAME_RATIO) for name in table.columns):
+    if not any(difflib.get_close_matches(name, COLUMNS, 1) for name in table.columns):
         remedy = "name them as vinetrack settings does, and delete what stands above their names"
         raise ExperimentError([Problem("no_columns", "names no known column", file=path.name, line=1, remedy=remedy)])
     problems += [warning("unknown_column", message, name, line=1, remedy=did_you_mean(name, left)) for name in unknown]
