@@ -178,7 +178,7 @@ class Search:
                 self.extend(base, 3)
         for best in self.of_size(size)[:1]:
             least = min(best.effects, key=partial(size_in_errors, after=best.fit))
-            smaller = self.subset(best, [effect for effect in best.effects if effect is not least])
+            smaller = self.subset(best, [effect for effect in best.effects if effect is not least], again=True)
             if smaller is not None and smaller.fit.log_likelihood > bases[0].fit.log_likelihood:
                 self.extend(smaller, 3)
         return self.of_size(size)
@@ -550,7 +550,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         # A score that no refit confirms counts only if another test rejects the model too.
         hypotheses = search.of_size(1)
         return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else ADEQUATE)
-    return _effect_set_rounds(search)
+    return _effect_set_rounds(search, alone)
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
@@ -560,12 +560,18 @@ def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
     return MISSING if len(adequate) == 1 else AMBIGUOUS
 
 
-def _effect_set_rounds(search: Search) -> list[SelectionStep]:
-    """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`."""
+def _effect_set_rounds(search: Search, alone: Sequence[LikelihoodRatio]) -> list[SelectionStep]:
+    """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`. A set
+    that ends higher once it is fitted from a larger one is tested again, beside hypotheses that stand `alone`.
+    """
     best_so_far, rejected = search.of_size(1)[0], dict[str, Remark]()
     for size in range(2, MAX_EFFECTS + 1):
         search.report(f"{size} effects together")
-        of_this_size = search.grow(size)
+        of_this_size, smaller = search.grow(size), search.of_size(size - 1)
+        if smaller[0].fit.log_likelihood > best_so_far.fit.log_likelihood:
+            adequate, of_these, after = adequate_hypotheses([*smaller, *(alone if size == 2 else ())], search)
+            if after is not None:
+                return _rounds(search, (*search.fitted.values(), *alone), adequate, of_these, after)
         if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
         adequate, of_these, after = adequate_hypotheses(of_this_size, search)
