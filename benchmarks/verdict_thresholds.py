@@ -37,7 +37,7 @@ THRESHOLDS = (
     *("FALSE_ALARM_LEVEL_FIRST_ROUND", "FALSE_ALARM_LEVEL_LATER_ROUNDS", "PROBE_LEVEL", "FAR_OFF_CHI2_PER_DOF"),
     *("MISSED_FRACTION", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS", "ANSWER_SET_DELTA_CHI2"),
     *("CAREFUL_PRESSURE_SCATTER", "CAREFUL_DAMPING_SCATTER", "OUT_OF_REACH", "CREDIBLE_RANGE_FACTOR"),
-    *("PARTIAL_SHARE", "MIN_LINEAR_GAIN", "FALSE_ALARM_LEVEL"),
+    *("MIN_LINEAR_GAIN", "FALSE_ALARM_LEVEL"),
 )
 """Numbers of `vinetrack.diagnosis` that decide between one verdict and another. Those that only bound the time of a
 search, or the words of a sentence, are not among them."""

@@ -366,7 +366,7 @@ def _deviates(curves: Floats, log_force: Floats, kept: NDArray[np.intp]) -> tupl
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:
-    """Twice the driving force on the tip: pressure above the yield pressure, and weight; as in `kinematics.force`."""
+    """Twice the driving force on the tip: pressure above the yield pressure, and weight; as in `kinematics.steady`."""
     middle_m = np.array([0.25 * np.nan_to_num(trial.length_m)])
     mass_kg = float(np.nan_to_num(trial.moving_mass_kg(middle_m))[0])
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)

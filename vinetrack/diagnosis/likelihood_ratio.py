@@ -234,11 +234,9 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
     """
     try:
         # 14, 40: iterations of a full fit at first, and of one that is near then (chosen)
-        first, least = 14, best - FAR_BEHIND
-        fit = refit(before, model, most_iterations=first, least=least, **how)
-        is_done = fit.converged or fit.iterations < first or fit.log_likelihood < least
-        if is_done or is_poor_fit(fit.predictor, fit.solution):
+        fit = refit(before, model, most_iterations=14, least=best - FAR_BEHIND, **how)
+        if fit.converged or fit.iterations < 14 or is_poor_fit(fit.predictor, fit.solution):
             return fit
-        return refit(fit, most_iterations=40, least=least)
+        return refit(fit, most_iterations=40, least=best - FAR_BEHIND)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None

@@ -68,16 +68,6 @@ from vinetrack.inference.solving import assemble
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
-# Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
-# (chosen)
-PARTIAL_SHARE = 0.5
-
-FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
-
-MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
-
-STARTS_PER_EFFECT = 2  # Shapes of an effect from which it is fitted, before its usual values (chosen)
-
 Names = frozenset[str]
 
 Report = Callable[[str], None]  # Called with a few words on what is being done
@@ -122,7 +112,8 @@ class Search:
         # By significance: of several sizes, or sizes that scatter, chance gains more.
         names, of_base = sorted(gains, key=lambda name: -tests.best_z(name)), frozenset(one.name for one in effects)
         if not every:
-            least = MIN_SHARE_OF_BEST_PREDICTION * max(gains.values(), default=0.0)
+            # 0.2: share of the best predicted gain from which an effect is fitted (chosen)
+            least = 0.2 * max(gains.values(), default=0.0)
             names = [name for name in names if gains[name] > least][:most]
         for name in names:
             if (of_base, name) not in self.tried:
@@ -148,7 +139,8 @@ class Search:
         for index in tests.ranked_shapes(name):  # A size that differs between vines is fitted so from any start.
             if all(shapes[k].other_values != shapes[index].other_values for k in by_gain.values()):
                 by_gain.setdefault(round(float(tests.predicted_gains[index]), 3), index)
-        of_gain = list(by_gain.values())[:STARTS_PER_EFFECT]
+        # 2: shapes of an effect from which it is fitted, before its usual values (chosen)
+        of_gain = list(by_gain.values())[:2]
         starts = [start_values(shapes[index], float(tests.scores.size[index])) for index in of_gain]
         effect = shapes[of_gain[0]].effect
         for start in [*starts, {}] if len(effect.parameters) > 1 else starts:
@@ -158,7 +150,7 @@ class Search:
             best, model = max(near, default=-math.inf), tests.fit.model + effect
             fit = full_fit(tests.fit, model, start=start, best=best)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
-            if fit is not None and gain >= FAILED_FIT_DELTA_CHI2:
+            if fit is not None and gain >= -1.0:  # up to rounding, no worse than without the effect (derived)
                 self._keep_best(likelihood_ratio(self.before, (*effects, effect), fit))
             # 0.7: share of its predicted gain that a fit must reach for no other shape to be tried (chosen)
             if gain > 0.7 * tests.predicted_gain(name):
@@ -274,7 +266,8 @@ class Search:
             if not plausible or (best is not None and not self.is_better(plausible[0], best)):
                 break
             best = plausible[0]
-        if best is None or best.fit.chi2_per_dof - 1 >= (1 - PARTIAL_SHARE) * (self.before.chi2_per_dof - 1):
+        # 0.5: share of the excess of χ² per degree of freedom over 1 that they must remove to be shown (chosen)
+        if best is None or best.fit.chi2_per_dof - 1 >= 0.5 * (self.before.chi2_per_dof - 1):
             return ()
         steps = [self.subset(best, best.effects[: k + 1]) for k in range(len(best.effects))]
         return tuple(step for step in steps if step is not None)
