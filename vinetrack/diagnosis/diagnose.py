@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Floats, Track, Trial, with_flag
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.core.units import BASE_EFFECTS, GRAVITY_M_S2
+from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
@@ -164,7 +164,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
         explanation=in_words(step),
         slips=step.slips,
         cosines=Cosines(names, cosines.tolist()),
-        confounded=confounders_of(tests, BASE_EFFECTS) if step.verdict == ADEQUATE else (),
+        confounded=confounders_of(tests) if step.verdict == ADEQUATE else (),
         fit=tests.fit,
         fits=tuple(one.fit for one in step.answer_set if one.effects[-1].kind != BETWEEN_TRIALS),
         sets=sets if any(len(effects) > 1 for effects in sets) else (),
@@ -195,7 +195,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
             in_answer_set=in_answer_set,
             reason=rejected.get(name, single.reason),
             along=single.others if in_answer_set else (),
-            confounded_by=tuple(each for each in step.confounded if each.parameter.split(".")[0] == name),
         )
         if not single.fit.converged and single.fit.log_likelihood < reached - FAR_BEHIND:
             row = replace(row, numbers=(), reason=remark("given_up"))

@@ -280,7 +280,6 @@ class Candidate(JsonRecord):
     reason: Annotated[StoredRemark, Field(alias="reason_code")] = field(default_factory=Remark)
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
-    confounded_by: tuple[Confounder, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -301,7 +300,7 @@ class Cosines(JsonRecord):
 @dataclass(frozen=True, kw_only=True)
 class Round(JsonRecord):
     """One model and its tests against all candidates. `ranking` has the best first, those not testable last;
-    `confounded` is what n of a model that is adequate may include.
+    `confounded` is what n and sizes of a model that is adequate may include.
     """
 
     model: tuple[str, ...] = ()

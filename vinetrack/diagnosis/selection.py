@@ -399,17 +399,17 @@ def adequate_hypotheses(
 # one shifted. Effects are considered one at a time and to first order.
 
 
-def confounders_of(after: MisfitTests, names: Sequence[str]) -> tuple[Confounder, ...]:
-    """Find, for each size of effects that were added, the physical effects that it may include, and for n, faults of
-    the measurement too, each in the shape that shifts it most. Returns for each those that could shift it by more than
-    its standard error, the largest first.
+def confounders_of(after: MisfitTests) -> tuple[Confounder, ...]:
+    """Find, for each size of an effect in the model, the physical effects that it may include, and for n, faults of the
+    measurement too, each in the shape that shifts it most. Returns for each those that could shift it by more than its
+    standard error, the largest first.
     """
     shapes, chosen = after.products.shapes, list[Confounder]()
     of_numbers = zip(after.fit.numbers, after.fit.predictor.layout.free, after.scores.levers, strict=False)
     for number, free, scaled in of_numbers:
         name, lever = number.key.split(".")[0], scaled * free.derivative(number.value)
         is_size = name not in BASE_EFFECTS
-        if name not in names or not (is_size or number.key == EXPONENT) or not 0 < number.sigma < math.inf:
+        if not (is_size or number.key == EXPONENT) or not 0 < number.sigma < math.inf:
             continue
         largest: dict[str, tuple[float, Confounder]] = {}
         for k, shape in enumerate(shapes):
@@ -477,7 +477,6 @@ class SelectionStep:
     fitted: tuple[LikelihoodRatio, ...] = ()
     rejected: tuple[tuple[str, Remark], ...] = ()
     answer_names: tuple[str, ...] = ()
-    confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
 
@@ -637,6 +636,5 @@ def _rounds(
         fitted, reasons = alternatives, ()
     verdict = verdict_of(alternatives)
     names = tuple(sorted(dict.fromkeys(name for hypothesis in alternatives for name in hypothesis.names), key=order))
-    confounded = confounders_of(after, best.names) if verdict == MISSING else ()
-    last = SelectionStep(verdict, round_tests, alternatives, fitted, reasons, names, confounded=confounded)
+    last = SelectionStep(verdict, round_tests, alternatives, fitted, reasons, names)
     return [*steps, last, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [*steps, last]

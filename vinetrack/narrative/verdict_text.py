@@ -24,7 +24,6 @@ from vinetrack.diagnosis.result import (
     REFITTED,
     TAIL_SLACK,
     UNEXPLAINED,
-    Confounder,
 )
 from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment.folder import trial_order
@@ -383,10 +382,7 @@ def estimates_text(row: Candidate) -> str:
 
 def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     """The wider interval of a size that allows for effects the data do not exclude (hull); blank without any."""
-    alike: list[Confounder] = []
-    for entry in diagnosis.rounds:
-        rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
-        alike = [rival for rival in (*rivals, *entry.confounded) if rival.parameter == size.key] or alike
+    alike = [rival for rival in diagnosis.rounds[-1].confounded if rival.parameter == size.key]
     if not alike:
         return ""
     factor = size.shown[1]
