@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (637, 2, 2),
     "core": (952, 7, 23),
-    "diagnosis": (5830, 14, 87),
+    "diagnosis": (5810, 14, 83),
     "dynamics": (2231, 8, 26),
     "effects": (565, 3, 7),
     "experiment": (1600, 5, 15),

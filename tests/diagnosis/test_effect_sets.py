@@ -91,6 +91,16 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2, inflation=inflation)) == better
 
 
+def test_a_set_that_ends_higher_from_a_larger_one_is_tested_again(monkeypatch):
+    """Capstan friction alone had ended in a local minimum, and was named with a second effect."""
+    search = sets_of([of(NAMES[:1], -100.0)])
+    search.grow = lambda _: search._keep_best(of(NAMES[1:2], -50.0)) or [of(NAMES[:2], -49.0)]
+    told = {"adequate_hypotheses": lambda known, _: (known[:1], {}, "after"), "_rounds": lambda *told: told[2]}
+    for name, function in told.items():
+        monkeypatch.setattr(selection, name, function)
+    assert [one.names for one in selection._effect_set_rounds(search, [])] == [NAMES[1:2]]
+
+
 def test_sizes_of_several_vines_are_as_many_degrees_of_freedom():
     names = (*NAMES[:2], "film_mass")
     numbers = tuple(SimpleNamespace(key=key) for key in ("film_mass.eps",) * 3 + ("leak.rate", "air_drag.C_D"))

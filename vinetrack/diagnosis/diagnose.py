@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
@@ -49,10 +48,9 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
+from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.inference.sensitivity import middle_speed
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing, longer_than_stated
 from vinetrack.tracks.position_noise import rejected_points_note
 
@@ -99,13 +97,20 @@ def diagnose(
         if name not in by_request:
             unfit.setdefault(reason, []).append(name)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
-    if odd := odd_trials(fit.predictor.data):
-        names = [trial.name for trial in odd]
-        told.append(remark("odd_trials", odd=odd, names=names, others=len(fit.trials) - len(odd)))
-        others = [pair for pair in pairs if pair[0].name not in names]
-        fit = initial_fit(model, others, effects)
-    result = _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
-    result = with_lost_frames(replace(result, odd_trials=tuple(trial.name for trial in odd)), dropped)
+
+    def diagnosed(odd: Sequence[OddTrial]) -> Diagnosis:
+        names, of_rest = tuple(trial.name for trial in odd), fit
+        if odd:
+            of_rest = initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects)
+            told.append(remark("odd_trials", odd=odd, names=names, others=len(of_rest.trials)))
+        of_rest = replace(of_rest, left_out={**left_out, **fit.left_out})
+        return replace(_diagnosis_of(of_rest, effects, report), odd_trials=names)
+
+    result = diagnosed([])
+    if odd := odd_trials((*result.fits, *result.rounds[-1].partial_fits)[-1]):
+        others = diagnosed(odd)
+        result = others if others.final_verdict == ADEQUATE else result
+    result = with_lost_frames(result, dropped)
     told.append(longer_than_stated(pairs))
     if far_off := _far_off(result.fits[-1]):
         told.append(remark("far_off", names=list(far_off), percent=100 * max(far_off.values())))
@@ -279,15 +284,15 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
 
 
 # ------------------------------------------------------------------------------
-# Outlying trials: a row of the sheet that belongs to another recording, or a typing error. They are detected without
-# any model: over the middle of the growth damping roughly balances the force,
+# Odd trials: a row of the sheet that belongs to another recording, or a typing error. A fit gives a trial deviations of
+# pressure and B, which together are one of the force that damping balances,
 #
-#     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
+#     Δ ln F = ln (1 + p P A / F) − b,    F = (P − P_y) A + r m̄ g cos θ
 #
-# with a curvature c for a force of another power of speed. The residual of a trial from these curves is compared with
-# the scatter of the others about them, and the farthest is left out, one after the other, up to the last that is too
-# far: two outliers cannot hide each other (generalised ESD: Rosner, Technometrics 25, 165, 1983). An effect that the
-# model lacks changes all trials of a condition alike; a pressure with its digits swapped does not.
+# The farthest is held against the others, and left out, one after the other, up to the last that is too far: two
+# outliers cannot hide each other (generalised ESD: Rosner, Technometrics 25, 165, 1983). An effect that the model lacks
+# changes all trials of a condition alike; a pressure with its digits swapped does not. They are believed where the
+# others leave nothing unexplained.
 
 CHANCE = 1e-3  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
@@ -305,63 +310,42 @@ class OddTrial:
     unit: str = "kPa"
 
 
-def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
-    """Find trials whose speed contradicts the sheet although the other trials agree with it."""
-    trials = [trial_data.trial for trial_data in data]
-    if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
+def odd_trials(fit: Fit) -> list[OddTrial]:
+    """Find trials whose force is off by far more than that of the others; else those that the model alone misses."""
+    trials, data = [one.trial for one in fit.trials], fit.predictor.data
+    if len(trials) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
         return []
-    stated_Pa = [trial_data.typical_pressure_Pa for trial_data in data]
-    force_N = np.array([_force_N(*pair) for pair in zip(trials, stated_Pa, strict=True)])
-    of_vine = np.array([trial.vine for trial in trials])
-    vines = np.unique(of_vine)
-    # 2: slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
-    remaining = len(data) - vines.size - 2
-    if remaining < 1:
-        return []
-    # A trial that its stated force could not move lies far off every curve.
-    log_force = np.log(np.maximum(force_N, 1e-9))
-    log_speed = np.log([middle_speed(trial_data) for trial_data in data])
-    log_speed -= np.median(log_speed)
-    curves = np.column_stack([*(of_vine == vine for vine in vines), log_speed, log_speed**2])
-    # 0.125: the largest fraction that may be outliers (chosen)
-    kept, most, far, count = np.arange(len(data)), max(2, int(0.125 * len(data))), list[int](), 0
-    while len(far) <= most:
-        *_, deviates = _deviates(curves, log_force, kept)
-        worst = int(np.argmax(deviates[kept]))
-        far.append(int(kept[worst]))
-        count = len(far) if deviates[far[-1]] > 1 else count
-        kept = np.delete(kept, worst)
-    if not 0 < count <= most:
-        return []
-    residual, allowed, _ = _deviates(curves, log_force, np.setdiff1d(np.arange(len(data)), far[:count]))
-    replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
-             for k, trial in enumerate(trials)]  # fmt: skip
-    # Where a replicate deviates as much, the cause is physics of the condition.
-    odd = [
-        k
-        for k in sorted(far[:count])
-        if all(abs(residual[j]) < allowed < abs(residual[k] - residual[j]) for j in replicates[k])
-    ]
-    lacking_Pa = [(math.exp(log_force[k] - residual[k]) - force_N[k]) / trials[k].area_m2 for k in odd]
-    return [
-        OddTrial(trials[k].name, stated_Pa[k], stated_Pa[k] + float(lacks), trials[k].pressure_unit)
-        for k, lacks in zip(odd, lacking_Pa, strict=True)
-    ]
+    stated_Pa, area_m2 = np.transpose([(one.typical_pressure_Pa, one.trial.area_m2) for one in data])
+    force_N = np.array(list(map(_force_N, trials, stated_Pa.tolist())))
+    deviations = np.array([(one.pressure_deviation, math.log1p(one.damping_deviation)) for one in fit.trials])
+    off = np.log(np.maximum(1 + deviations[:, 0] * stated_Pa * area_m2 / force_N, 0.05)) - deviations[:, 1]
+    implied_Pa = (stated_Pa + np.expm1(off) * force_N / area_m2).tolist()
+    far = _farthest(off)
+    found = [OddTrial(trials[k].name, float(stated_Pa[k]), implied_Pa[k], trials[k].pressure_unit) for k in far]
+    found = found or [OddTrial(name, math.nan, math.nan) for name in _far_off(fit)]
+    # Where two replicates are odd, the cause is physics of the condition.
+    conditions = {trial.condition for trial in trials if trial.name in {one.name for one in found}}
+    return found if len(conditions) == len(found) <= _most(len(trials)) else []
 
 
-def _deviates(curves: Floats, log_force: Floats, kept: NDArray[np.intp]) -> tuple[Floats, float, Floats]:
-    """Residuals of all trials from curves through those kept, the residual allowed to one of these, and how many times
-    that each is: by Student's t of its residual from the curves through the others.
-    """
-    inverse = np.linalg.pinv(curves[kept])
-    residual, degrees = log_force - curves @ (inverse @ log_force[kept]), max(kept.size - curves.shape[1] - 1, 1)
-    shown, square = np.ones(residual.size), np.sum(residual[kept] ** 2)
-    shown[kept] = np.maximum(1 - np.sum(curves[kept] * inverse.T, axis=1), 1e-9)  # part of a deviation that is left
-    # 0.02: least scatter of ln F, that of careful trials (chosen)
-    of_others = np.sqrt(np.maximum((square - residual**2 / shown) / degrees, 0.02**2))
-    quantile = -float(stdtrit(degrees, CHANCE / (2 * kept.size)))
-    allowed = quantile * max(math.sqrt(square / (degrees + 1)), 0.02)
-    return residual, allowed, np.abs(residual) / np.sqrt(shown) / of_others / quantile * (shown > 1e-6)
+def _farthest(values: Floats) -> list[int]:
+    """Indices of the values too far from the others, in order; none where they would be too many."""
+    kept, far, count = np.arange(values.size), list[int](), 0
+    while len(far) <= _most(values.size):
+        worst = int(np.argmax(np.abs(values[kept] - np.median(values[kept]))))
+        farthest, kept = int(kept[worst]), np.delete(kept, worst)
+        far.append(farthest)
+        # 0.02: least scatter of ln F, that of careful trials (chosen)
+        scatter = max(float(np.std(values[kept], ddof=1)), 0.02) * math.sqrt(1 + 1 / kept.size)
+        quantile = -float(stdtrit(kept.size - 1, CHANCE / (2 * (kept.size + 1))))
+        if abs(values[farthest] - np.mean(values[kept])) > quantile * scatter:
+            count = len(far)
+    return sorted(far[:count]) if count <= _most(values.size) else []
+
+
+def _most(trials: int) -> int:
+    """How many of so many trials may be odd."""
+    return max(2, int(0.125 * trials))  # 0.125: the largest fraction (chosen)
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:
@@ -369,7 +353,8 @@ def _force_N(trial: Trial, pressure_Pa: float) -> float:
     middle_m = np.array([0.25 * np.nan_to_num(trial.length_m)])
     mass_kg = float(np.nan_to_num(trial.moving_mass_kg(middle_m))[0])
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
-    return (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
+    driving_N = (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
+    return max(driving_N, 0.05 * pressure_Pa * trial.area_m2, 1e-9)  # 0.05: of a vine that hardly moves (chosen)
 
 
 # ------------------------------------------------------------------------------
