@@ -98,18 +98,17 @@ def diagnose(
             unfit.setdefault(reason, []).append(name)
     told = [remark("not_in_the_fit", names=names, reason=reason) for reason, names in unfit.items()]
 
-    def diagnosed(odd: Sequence[OddTrial]) -> Diagnosis:
-        names, of_rest = tuple(trial.name for trial in odd), fit
-        if odd:
-            of_rest = initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects)
-            told.append(remark("odd_trials", odd=odd, names=names, others=len(of_rest.trials)))
-        of_rest = replace(of_rest, left_out={**left_out, **fit.left_out})
-        return replace(_diagnosis_of(of_rest, effects, report), odd_trials=names)
+    def diagnosed(fit: Fit) -> Diagnosis:
+        return _diagnosis_of(replace(fit, left_out={**left_out, **fit.left_out}), effects, report)
 
-    result = diagnosed([])
-    if odd := odd_trials((*result.fits, *result.rounds[-1].partial_fits)[-1]):
-        others = diagnosed(odd)
-        result = others if others.final_verdict == ADEQUATE else result
+    result = diagnosed(fit)
+    last_fit = (*result.fits, *result.rounds[-1].partial_fits)[-1]
+    if result.final_verdict in (ADEQUATE, UNEXPLAINED) and (odd := odd_trials(last_fit)):
+        names = tuple(trial.name for trial in odd)
+        others = diagnosed(initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects))
+        if others.final_verdict == ADEQUATE:
+            told.append(remark("odd_trials", odd=odd, names=names, others=len(others.fit.trials)))
+            result = replace(others, odd_trials=names)
     result = with_lost_frames(result, dropped)
     told.append(longer_than_stated(pairs))
     if far_off := _far_off(result.fits[-1]):
