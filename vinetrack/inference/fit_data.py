@@ -347,7 +347,7 @@ def pairs_of(
             continue
         if trial.track is None:
             untracked = "its recording has not been tracked: run `vinetrack run`, or give its track"
-            left_out[trial.name] = untracked if tracks is None else "it failed, and `trials.csv` has the reason"
+            left_out[trial.name] = untracked if tracks is None else "tracking failed, and `trials.csv` has the reason"
             continue
         try:
             pairs.append((trial, correct_frames(load_track(trial))))
