@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis import diagnose as diagnosing
 from vinetrack.diagnosis.diagnose import diagnose, odd_trials
 from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors, replicates_of
-from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
@@ -155,18 +156,24 @@ def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
 
 def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):
     there = vt.fit(vt.base_model(), stated(campaign, t2=12))
-    data = [
+    there.predictor.data = [
         replace(one, trial=trial, trace=(one.time_s, np.full(one.time_s.size, one.trial.pressure_Pa)))
         for one, (trial, _) in zip(there.predictor.data, campaign, strict=True)
     ]
-    there.predictor.data = data
-    (slip,) = odd_trials(there)
-    assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
+    assert [(one.name, one.stated_Pa) for one in odd_trials(there)] == [("t2", 12e3)]
 
 
-def test_usual_trials_are_rarely_odd(monkeypatch):
-    """Normal scatter of 24 trials, at ten times the level."""
-    monkeypatch.setattr("vinetrack.diagnosis.diagnose.CHANCE", 1e-2)
+def test_usual_trials_are_rarely_odd_nor_are_many(monkeypatch):
+    monkeypatch.setattr("vinetrack.diagnosis.diagnose.CHANCE", 1e-2)  # ten times the level
     draw = np.random.default_rng(20050)
     assert sum(bool(diagnosing._farthest(0.05 * draw.standard_normal(24))) for _ in range(600)) <= 12
     assert diagnosing._farthest(np.append(0.02 * draw.standard_normal(11), 0.2)) == [11]
+    assert diagnosing._farthest(np.append(0.02 * draw.standard_normal(13), [0.5, 5.0, 50.0])) == []
+
+
+@pytest.mark.parametrize(("others", "odd"), [("unexplained", ()), ("adequate", ("t2",))])
+def test_a_trial_is_odd_only_where_the_others_leave_nothing_unexplained(campaign, monkeypatch, others, odd):
+    rounds = iter([(Round(verdict="unexplained"),), (Round(verdict=others),)])
+    monkeypatch.setattr(diagnosing, "odd_trials", lambda _: [SimpleNamespace(name="t2")])
+    monkeypatch.setattr(diagnosing, "_diagnosis_of", lambda fit, *_: Diagnosis(rounds=next(rounds), fits=(fit,)))
+    assert diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False).odd_trials == odd
