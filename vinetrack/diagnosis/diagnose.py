@@ -317,6 +317,7 @@ def odd_trials(fit: Fit) -> list[OddTrial]:
     stated_Pa, area_m2 = np.transpose([(one.typical_pressure_Pa, one.trial.area_m2) for one in data])
     force_N = np.array(list(map(_force_N, trials, stated_Pa.tolist())))
     deviations = np.array([(one.pressure_deviation, math.log1p(one.damping_deviation)) for one in fit.trials])
+    # 0.05: least part of its stated force that a trial may have (chosen)
     off = np.log(np.maximum(1 + deviations[:, 0] * stated_Pa * area_m2 / force_N, 0.05)) - deviations[:, 1]
     implied_Pa = (stated_Pa + np.expm1(off) * force_N / area_m2).tolist()
     far = _farthest(off)
