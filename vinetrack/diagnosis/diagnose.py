@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
@@ -48,7 +49,8 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
+from vinetrack.inference.fit import predict_prepared
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing, longer_than_stated
@@ -103,10 +105,15 @@ def diagnose(
 
     result = diagnosed(fit)
     last_fit = (*result.fits, *result.rounds[-1].partial_fits)[-1]
-    if result.final_verdict in (ADEQUATE, UNEXPLAINED) and (odd := odd_trials(last_fit)):
-        names = tuple(trial.name for trial in odd)
+    if result.final_verdict in (ADEQUATE, UNEXPLAINED) and (names := odd_trials(last_fit)):
         others = diagnosed(initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects))
         if others.final_verdict == ADEQUATE:
+            model_fit = others.fits[-1]
+            odd = [
+                (one.trial.name, one.trial.pressure_unit, one.typical_pressure_Pa, implied_pressure_Pa(model_fit, one))
+                for one in last_fit.predictor.data
+                if one.trial.name in names
+            ]
             told.append(remark("odd_trials", odd=odd, names=names, others=len(others.fit.trials)))
             result = replace(others, odd_trials=names)
     result = with_lost_frames(result, dropped)
@@ -297,35 +304,40 @@ CHANCE = 1e-3  # Probability that normal scatter makes any trial of a campaign a
 FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
 
 
-@dataclass(frozen=True)
-class OddTrial:
-    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa, and the unit of the
-    sheet. `implied_pressure_Pa` is NaN where it is not known.
-    """
-
-    name: str
-    stated_Pa: float
-    implied_pressure_Pa: float
-    unit: str = "kPa"
-
-
-def odd_trials(fit: Fit) -> list[OddTrial]:
+def odd_trials(fit: Fit) -> tuple[str, ...]:
     """Find trials whose force is off by far more than that of the others; else those that the model alone misses."""
     trials, data = [one.trial for one in fit.trials], fit.predictor.data
     if len(trials) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
-        return []
-    stated_Pa, area_m2 = np.transpose([(one.typical_pressure_Pa, one.trial.area_m2) for one in data])
-    force_N = np.array(list(map(_force_N, trials, stated_Pa.tolist())))
+        return ()
+    pressures = [one.typical_pressure_Pa for one in data]
+    force_Pa = np.array([_force_N(*one) / one[0].area_m2 for one in zip(trials, pressures, strict=True)])
     deviations = np.array([(one.pressure_deviation, math.log1p(one.damping_deviation)) for one in fit.trials])
     # 0.05: least part of its stated force that a trial may have (chosen)
-    off = np.log(np.maximum(1 + deviations[:, 0] * stated_Pa * area_m2 / force_N, 0.05)) - deviations[:, 1]
-    implied_Pa = (stated_Pa + np.expm1(off) * force_N / area_m2).tolist()
-    far = _farthest(off)
-    found = [OddTrial(trials[k].name, float(stated_Pa[k]), implied_Pa[k], trials[k].pressure_unit) for k in far]
-    found = found or [OddTrial(name, math.nan, math.nan) for name in _far_off(fit)]
+    off = np.log(np.maximum(1 + deviations[:, 0] * pressures / force_Pa, 0.05)) - deviations[:, 1]
+    found = tuple(trials[k].name for k in _farthest(off)) or tuple(_far_off(fit))
     # Where two replicates are odd, the cause is physics of the condition.
-    conditions = {trial.condition for trial in trials if trial.name in {one.name for one in found}}
-    return found if len(conditions) == len(found) <= _most(len(trials)) else []
+    conditions = {trial.condition for trial in trials if trial.name in found}
+    return found if len(conditions) == len(found) <= _most(len(trials)) else ()
+
+
+def implied_pressure_Pa(fit: Fit, data: FitTrial) -> float:
+    """The pressure under which trials of a fit would have moved as another trial did; NaN where there is none."""
+
+    def missed(log_factor: float) -> float:
+        """Part of its growth by which the fit misses the trial, its pressure times a factor."""
+        factor, trial, trace = math.exp(log_factor), data.trial, data.trace
+        scaled_trial, scaled_trace = replace(trial, pressure_Pa=factor * trial.pressure_Pa), trace
+        if trace is not None:
+            scaled_trace = (trace[0], factor * trace[1])
+        try:
+            (moved,) = predict_prepared(fit, [replace(data, trial=scaled_trial, trace=scaled_trace)])
+        except FitError:
+            return math.inf
+        return moved.rms_m / float(np.ptp(data.lead_position_m))
+
+    near = min(np.arange(-3, 3.1, 0.25), key=missed)  # Up to a factor of twenty, where no vine moves or all jump
+    best = minimize_scalar(missed, bounds=(near - 0.25, near + 0.25), method="bounded", options={"xatol": 1e-3})
+    return data.typical_pressure_Pa * math.exp(best.x) if best.fun < LARGEST_MISSED else math.nan
 
 
 def _farthest(values: Floats) -> list[int]:

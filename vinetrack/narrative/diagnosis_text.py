@@ -441,10 +441,9 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "remedy": lambda source: SHARED_REMEDIES[source],
     "pressure": lambda pressure_in: pressure_text(*pressure_in),
     "implied": lambda odd: "".join(
-        f" {one.name} moves as at {pressure_text(one.implied_pressure_Pa, one.unit)}, but "
-        f"{pressure_text(one.stated_Pa, one.unit)} is stated."
-        for one in odd
-        if one.implied_pressure_Pa > 0
+        f" {name} moves as at {pressure_text(implied_Pa, unit)}, but {pressure_text(stated_Pa, unit)} is stated."
+        for name, unit, stated_Pa, implied_Pa in odd
+        if implied_Pa > 0
     ),
     "condition": lambda condition: _condition_text(**condition),
     "off": lambda off_m: f"{with_error(*(1e3 * abs(m) for m in off_m))} mm",
