@@ -16,9 +16,8 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
-from vinetrack.core.records import Floats, Track, Trial, with_flag
+from vinetrack.core.records import Floats, Track, with_flag
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
@@ -293,7 +292,7 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
 # Odd trials: a row of the sheet that belongs to another recording, or a typing error. A fit gives a trial deviations of
 # pressure and B, which together are one of the force that damping balances,
 #
-#     Δ ln F = ln (1 + p P A / F) − b,    F = (P − P_y) A + r m̄ g cos θ
+#     Δ ln F = ln (1 + p P / (P − P_y)) − b
 #
 # The farthest is held against the others, and left out, one after the other, up to the last that is too far: two
 # outliers cannot hide each other (generalised ESD: Rosner, Technometrics 25, 165, 1983). An effect that the model lacks
@@ -309,11 +308,12 @@ def odd_trials(fit: Fit) -> tuple[str, ...]:
     trials, data = [one.trial for one in fit.trials], fit.predictor.data
     if len(trials) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
         return ()
-    pressures = [one.typical_pressure_Pa for one in data]
-    force_Pa = np.array([_force_N(*one) / one[0].area_m2 for one in zip(trials, pressures, strict=True)])
+    pressure_Pa = np.array([one.typical_pressure_Pa for one in data])
+    over_Pa = pressure_Pa - [np.nan_to_num(trial.yield_pressure_Pa) for trial in trials]
     deviations = np.array([(one.pressure_deviation, math.log1p(one.damping_deviation)) for one in fit.trials])
-    # 0.05: least part of its stated force that a trial may have (chosen)
-    off = np.log(np.maximum(1 + deviations[:, 0] * pressures / force_Pa, 0.05)) - deviations[:, 1]
+    # 0.05: least part of a pressure above the yield pressure, and of its stated force that a trial may have (chosen)
+    relative = deviations[:, 0] * pressure_Pa / np.maximum(over_Pa, 0.05 * pressure_Pa)
+    off = np.log(np.maximum(1 + relative, 0.05)) - deviations[:, 1]
     found = tuple(trials[k].name for k in _farthest(off)) or tuple(_far_off(fit))
     # Where two replicates are odd, the cause is physics of the condition.
     conditions = {trial.condition for trial in trials if trial.name in found}
@@ -325,12 +325,11 @@ def implied_pressure_Pa(fit: Fit, data: FitTrial) -> float:
 
     def missed(log_factor: float) -> float:
         """Part of its growth by which the fit misses the trial, its pressure times a factor."""
-        factor, trial, trace = math.exp(log_factor), data.trial, data.trace
-        scaled_trial, scaled_trace = replace(trial, pressure_Pa=factor * trial.pressure_Pa), trace
-        if trace is not None:
-            scaled_trace = (trace[0], factor * trace[1])
+        factor = math.exp(log_factor)
+        trial = replace(data.trial, pressure_Pa=factor * data.trial.pressure_Pa)
+        trace = None if data.trace is None else (data.trace[0], factor * data.trace[1])
         try:
-            (moved,) = predict_prepared(fit, [replace(data, trial=scaled_trial, trace=scaled_trace)])
+            (moved,) = predict_prepared(fit, [replace(data, trial=trial, trace=trace)])
         except FitError:
             return math.inf
         return moved.rms_m / float(np.ptp(data.lead_position_m))
@@ -358,15 +357,6 @@ def _farthest(values: Floats) -> list[int]:
 def _most(trials: int) -> int:
     """How many of so many trials may be odd."""
     return max(2, int(0.125 * trials))  # 0.125: the largest fraction (chosen)
-
-
-def _force_N(trial: Trial, pressure_Pa: float) -> float:
-    """Twice the driving force on the tip: pressure above the yield pressure, and weight; as in `kinematics.steady`."""
-    middle_m = np.array([0.25 * np.nan_to_num(trial.length_m)])
-    mass_kg = float(np.nan_to_num(trial.moving_mass_kg(middle_m))[0])
-    weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
-    driving_N = (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + weight_N
-    return max(driving_N, 0.05 * pressure_Pa * trial.area_m2, 1e-9)  # 0.05: of a vine that hardly moves (chosen)
 
 
 # ------------------------------------------------------------------------------
