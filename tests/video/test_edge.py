@@ -146,10 +146,10 @@ def test_two_frames_of_rest_at_the_end_are_not_growth(speed):
 
 def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_corrected():
     luma = plain_scene(Plan(seed=212, **SHORT)).frames.copy()
-    luma[1], luma[25] = luma[-3], luma[24]
+    luma[1], luma[25], luma[-3:] = luma[-3], luma[24], 0
     track = pictures.tracked(np.delete(luma, 30, axis=0), 0.2).track
     assert (track.flag[1], track.flag[30]) == ("rejected", "gap;retimed")
-    assert np.isnan(track.edge_px[1])
+    assert np.flatnonzero(np.isnan(track.edge_px)).tolist() == [0, 1, *range(track.time_s.size)[-3:]]
     assert np.flatnonzero(with_flag(track.flag, "duplicate")).tolist() == [25]
     assert np.flatnonzero(with_flag(track.flag, "gap")).tolist() == [30]
     assert np.diff(track.time_s[28:32]) == pytest.approx([1e-3, 2e-3, 1e-3])

@@ -194,23 +194,28 @@ def quiet_log() -> Iterator[list[Said]]:
 
 
 # ------------------------------------------------------------------------------
-# Detect pictures that are not what the camera saw at their time: odd ones at the beginning.
+# Detect pictures that are not what the camera saw at their time: odd ones at either end.
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
-    """Frames among the first few that resemble none after them; some cameras write such. Shapes: luma (n_frames,
-    height, width) → (n_frames,).
+    """Frames among the first or last few that are cut off from the others, since more of the picture changes than
+    growth could: blank ones, or those of another scene or time. Shapes: luma (n_frames, height, width) → (n_frames,).
     """
-    odd = np.zeros(len(luma), dtype=bool)
-    if len(luma) < 8:
-        return odd
-    small = luma[:8, ::4, ::4].astype(np.float32)
+
+    def cut_off(pictures: NDArray[Any]) -> int:
+        """Number of the first pictures before the last cut."""
+        changes = np.abs(np.diff(pictures.astype(np.float32), axis=0))
+        # 6.0, 8.0: change of a pixel, in grey levels of 255 and in usual changes, that no noise makes (chosen)
+        unlike = changes > max(6.0 * unit, 8.0 * float(np.median(changes)))
+        # 0.15: part of the picture that no vine covers in a frame (chosen)
+        return 1 + int(np.max(np.flatnonzero(unlike.mean(axis=(1, 2)) > 0.15), initial=-1))
+
+    # 3, 10: frames at either end that may be odd, and one in how many of a long recording (chosen)
+    small, some = luma[:, ::4, ::4], max(3, len(luma) // 10) + 1
     unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
-    typical = float(np.median(np.abs(np.diff(small[3:], axis=0)).mean(axis=(1, 2))))
-    # 3: number of first frames that may be odd, which are compared with the next two (chosen)
-    # 8.0, 6.0: A frame is odd where it differs from later ones by this many times what neighbours differ by (chosen)
-    differ = np.abs(small[:3, None] - small[3:5]).mean(axis=(2, 3))
-    odd[:3] = differ.min(axis=1) > max(8.0 * typical, 6.0 * unit)
+    odd = np.zeros(len(luma), dtype=bool)
+    if len(luma) >= 8:
+        odd[: cut_off(small[:some])] = odd[len(luma) - cut_off(small[::-1][:some]) :] = True
     return odd
 
 

@@ -51,7 +51,7 @@ class ArrivalTracker(Tracker):
 
 NO_GROWTH = (
     "see whether it shows this vine grow, four times as far from its background as a pixel's noise, name the right "
-    "recording, or state the growth axis"
+    "recording, or state the growth axis, or by frames_used where it grows and does not draw back"
 )
 
 # Asked in turn: the first that knows what moves follows it; the others return None.
@@ -339,13 +339,13 @@ def track_pixels(
 
 
 def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
-    """Rows of the decoded frames that the sheet allows, of the longest undamaged stretch, without odd ones at the
-    start; and notes on the others.
+    """Rows of the decoded frames that the sheet allows, of the longest undamaged stretch, without odd ones at
+    either end; and notes on the others.
     """
     name = frames.recording.path.name
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(too_few(len(frames)), "name a film or a folder of pictures", name)
-    odd = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
+    odd = odd_frames(frames.luma)
     first, last = trial.frames_used or (0, len(frames.slots) - 1)
     number = frames.first + np.arange(len(frames))
     allowed: Bools = (number >= first) & (number <= last)
