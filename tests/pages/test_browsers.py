@@ -65,14 +65,14 @@ def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_
 def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor):
     """The tracked edge is drawn where the picture goes dark, the model's within a few millimetres of it."""
     visitor.chrome.run(f"{visitor.model('film_trial')}.value = {FILMED!r}")
-    visitor.until("$film_figure.visible && $film_edges.data.xs.length === 3", "the recording", 60)
+    visitor.until("$film_figure.visible && $film_edges.data.xs.length > 1", "the recording", 60)
     last = visitor.value("film_frame", "end")
     seen = []
     for frame in (int(0.5 * last), int(0.7 * last)):
         visitor.chrome.run(f"{visitor.model('film_frame')}.value = {frame}")
         visitor.until(f"$film_caption.text.includes('ms since') && $film_frame.value === {frame}", "the frame")
         time.sleep(0.6)
-        tracked, _, now = visitor.value("film_edges", "data.xs.map((x) => x[0])")
+        tracked, *_, now = visitor.value("film_edges", "data.xs.map((x) => x[0])")
         row = np.array(visitor.chrome.run(f"Array.from({visitor.model('film_picture')}.data.image[0].slice({ROW}))"))
         assert abs(tracked - (np.argmax(row < 120) - 0.5)) < 2.0
         assert abs(now - tracked) < 4 * 12
