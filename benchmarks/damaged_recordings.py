@@ -25,9 +25,8 @@ import numpy as np
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.campaigns import Filming, GroundTruth, film, grow
 from vinetrack.laboratory.scene import Camera
-from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording
 

@@ -21,7 +21,7 @@ import cv2
 from tracking_accuracy import CAPTURE_FPS, approach
 
 from vinetrack.core.records import Trial
-from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.campaigns import render_recording
 from vinetrack.laboratory.scene import preset
 from vinetrack.video.frames import DECODER_THREADS, read_frames
 from vinetrack.video.track import track_frames, track_recording

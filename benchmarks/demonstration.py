@@ -29,9 +29,16 @@ import yaml
 from vinetrack.core.tables import write_text
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.__main__ import DEMO
-from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
+from vinetrack.laboratory.campaigns import (
+    Filming,
+    VirtualTrial,
+    film,
+    grow,
+    make_filming,
+    picture_target,
+    read_ground_truth,
+)
 from vinetrack.laboratory.render import Truth
-from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth
 from vinetrack.video.survey import Measurement, measure_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "demo"

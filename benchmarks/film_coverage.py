@@ -34,8 +34,7 @@ from vinetrack.core.tables import write_text
 from vinetrack.dynamics.model import make_model
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.__main__ import DEMO
-from vinetrack.laboratory.filming import film, make_filming, picture_target
-from vinetrack.laboratory.tracks import grow, read_ground_truth
+from vinetrack.laboratory.campaigns import film, grow, make_filming, picture_target, read_ground_truth
 from vinetrack.video.survey import measure_recording
 
 NOISE_M = 1.2e-5  # Noise of positions that are not tracked, about that of the demonstration's

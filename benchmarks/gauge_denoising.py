@@ -26,7 +26,7 @@ from hidden.laboratory_rows import campaign
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.inference.gauge_noise import denoised_traces
-from vinetrack.laboratory.tracks import plain_track
+from vinetrack.laboratory.campaigns import plain_track
 
 LABORATORIES = (
     *("gauge_slow", "gauge_slow_depletion", "gauge_rounded", "gauge_held", "gauge_steps", "gauge_coarse"),

@@ -23,7 +23,7 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.results.folder_layout import Results, read_json
+from vinetrack.results import Results, read_json
 
 SETTINGS = {"damping": {"resamples": 100}, "figures": {"formats": ["png"], "dpi": 50}}
 """Few resamplings and small figures: what they show is not looked at here."""
@@ -135,7 +135,7 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     results : folder for its results.
     figures : whether figures are drawn and the report is written.
     """
-    from vinetrack.pipeline.stages import STAGES, Job
+    from vinetrack.pipeline.workflow import STAGES, Job
 
     read = read_experiment(folder)
     job = Job(read, results, run_settings(SETTINGS))

@@ -25,9 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.campaigns import Filming, GroundTruth, film, grow
 from vinetrack.laboratory.scene import Camera
-from vinetrack.laboratory.tracks import GroundTruth, grow
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESSURES_KPA = (30, 36, 42)

@@ -28,7 +28,7 @@ import numpy as np
 from tracking_accuracy import along_axis, approach
 
 from vinetrack.core.records import Trial
-from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.campaigns import render_recording
 from vinetrack.laboratory.scene import Camera, Door, Scene, preset
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.track import track_frames

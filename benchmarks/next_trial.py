@@ -35,7 +35,7 @@ from vinetrack.diagnosis.further_trials import NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow
+from vinetrack.laboratory.campaigns import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 TUBE, DAMPING, EXPONENT, GUESSED_WRONG = Vine(24.0, 200.0, 280.0), 6.44, 0.37, 1.15

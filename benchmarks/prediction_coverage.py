@@ -27,7 +27,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
+from vinetrack.laboratory.campaigns import GroundTruth, campaign, damping_values, grow, isometric_vine
 from vinetrack.planning.prediction import drawn_final_speeds
 from vinetrack.planning.predictive_inputs import FitNumbers, predictive_inputs
 

@@ -31,7 +31,7 @@ from unittest import mock
 import numpy as np
 
 from vinetrack.core.records import Trial
-from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.campaigns import render_recording
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.video import track

@@ -17,7 +17,7 @@ from PIL import Image
 
 import vinetrack
 from vinetrack.cli.main import app
-from vinetrack.pipeline.stages import STAGES
+from vinetrack.pipeline.workflow import STAGES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -143,7 +143,7 @@ MODULES = sorted(
     for path in (ROOT / "vinetrack").rglob("*.py")
     if path.name != "__init__.py" and ">>> " in path.read_text(encoding="utf-8")
 )
-FITTED = ("vinetrack.interface.loaded", "vinetrack.inference.fit", "vinetrack.inference.fit_summary")
+FITTED = ("vinetrack.interface", "vinetrack.inference.fit", "vinetrack.inference.fit_summary")
 
 
 @pytest.mark.parametrize("name", [pytest.param(m, marks=[pytest.mark.slow] * (m in FITTED)) for m in MODULES])

@@ -18,7 +18,7 @@ from lsoda_vine import grown_position, vine_trial
 
 import vinetrack
 from vinetrack.cli import main as commands
-from vinetrack.pipeline.stages import STAGES
+from vinetrack.pipeline.workflow import STAGES
 
 ROOT = Path(__file__).parents[1]
 N = 0.4

@@ -16,10 +16,9 @@ from commanded import run, succeed
 from test_pipeline import read_rows, snakemake
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.filming import Filming, film, picture_target
+from vinetrack.laboratory.campaigns import Filming, GroundTruth, film, grow, picture_target
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera, Target
-from vinetrack.laboratory.tracks import GroundTruth, grow
 
 pytestmark = [pytest.mark.slow, pytest.mark.pipeline]
 

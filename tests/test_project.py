@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from vinetrack.pipeline.stages import STAGES
+from vinetrack.pipeline.workflow import STAGES
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -28,7 +28,7 @@ from vinetrack.core.records import Trial
 from vinetrack.core.tables import parse_number, parse_table
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.pipeline.workflow import make_plan
-from vinetrack.results.folder_layout import describe_run, read_result
+from vinetrack.results import describe_run, read_result
 from vinetrack.tracks.importers import read_pressure_trace, read_track
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.track import track_recording

@@ -30,7 +30,7 @@ from vinetrack.diagnosis.propose import propose
 from vinetrack.dynamics.model import Model, probe
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, write_experiment
+from vinetrack.laboratory.campaigns import GroundTruth, damping_values, grow, write_experiment
 from vinetrack.pipeline.planning_stage import read_basis, read_si_range
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.planning.predictive_inputs import predictive_inputs
@@ -68,11 +68,13 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
 
 def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
     folder, log = one_vine(tmp_path / "v"), tmp_path / "logs" / "a.log"
-    monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
+    monkeypatch.setattr(
+        "vinetrack.pipeline.analysis.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen"))
+    )
     succeed("trials", folder, tmp_path / "r", "--log", log)
     assert "ZeroDivisionError: unforeseen" in log.read_text()
     assert "1 of 1 trial failed" in run("model", folder, tmp_path / "r").output
-    monkeypatch.setattr("vinetrack.pipeline.trials.gather", Mock(side_effect=RuntimeError("the bottom fell out")))
+    monkeypatch.setattr("vinetrack.pipeline.analysis.gather", Mock(side_effect=RuntimeError("the bottom fell out")))
     done = run("model", folder, tmp_path / "r", "--log", log)
     assert done.exit_code == 1
     assert "Traceback" not in done.output

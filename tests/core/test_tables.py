@@ -16,10 +16,10 @@ from vinetrack.core.tables import parse_number, parse_table, parse_yaml, safe_jo
 from vinetrack.core.terminal import progress, waiting
 from vinetrack.core.threads import in_one_blas_thread, njit
 from vinetrack.core.units import UNITS, convert, interval, number, split_unit, with_error, with_interval
-from vinetrack.dynamics.kernel import _cache_folder
+from vinetrack.dynamics.simulate import _cache_folder
 from vinetrack.pages.draft_files import save_model, with_value
-from vinetrack.pipeline.stages import COMPILING, compilation_told
-from vinetrack.results.folder_layout import Results
+from vinetrack.pipeline.workflow import COMPILING, compilation_told
+from vinetrack.results import Results
 
 PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
 ROWS = ({"trial": "a", "pressure_kPa": "28.5"}, {"trial": "b", "pressure_kPa": "14"})

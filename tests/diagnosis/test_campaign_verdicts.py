@@ -36,8 +36,8 @@ from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import relative_residuals, variance_floor
-from vinetrack.laboratory.tracks import Vine
-from vinetrack.laboratory.tracks import campaign as laboratory_campaign
+from vinetrack.laboratory.campaigns import Vine
+from vinetrack.laboratory.campaigns import campaign as laboratory_campaign
 from vinetrack.tracks.importers import flag_end_of_motion
 
 

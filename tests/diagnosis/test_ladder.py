@@ -32,8 +32,8 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import fit, predict_prepared, refit
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import EXPONENT, Number
-from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
-from vinetrack.pipeline import model_stage
+from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_vine
+from vinetrack.pipeline import analysis
 
 DEPLETION = "reservoir_depletion"
 
@@ -166,11 +166,11 @@ def test_a_model_that_cannot_be_followed_costs_its_own_predictions_alone(fits, m
             raise vt.FitError("it ends at 1.4 s")
         return align_trials(fit)
 
-    monkeypatch.setattr(model_stage, "align_trials", followed)
-    tables = [table for _, table in model_stage.predictions(*fits)]
+    monkeypatch.setattr(analysis, "align_trials", followed)
+    tables = [table for _, table in analysis.predictions(*fits)]
     assert len(tables) == len(fits[0].trials)
     assert all(table["model_before_m"].notna().all() and table["model_after_m"].isna().all() for table in tables)
-    assert model_stage.predictions(fits[1], fits[1]) == []
+    assert analysis.predictions(fits[1], fits[1]) == []
 
 
 def test_of_a_single_condition_nothing_can_be_left_out(pairs):

@@ -20,7 +20,7 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference import systematics
 from vinetrack.inference.fit_result import EXPONENT
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
 

@@ -18,7 +18,7 @@ from vinetrack.diagnosis.linear_power import planned_tests
 from vinetrack.diagnosis.result import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow
+from vinetrack.laboratory.campaigns import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import vinetrack as vt
 from vinetrack import effects
 from vinetrack.core.records import Bend, Trial
-from vinetrack.dynamics import kernel as batch
+from vinetrack.dynamics import simulate as batch
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, evaluate, motion_since
 from vinetrack.dynamics.model import check_needs, effects_on, host_for, shared_host, stated
 from vinetrack.dynamics.simulate import SimulationError, simulate_many

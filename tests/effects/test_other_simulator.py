@@ -35,9 +35,8 @@ from scipy.integrate import cumulative_trapezoid, solve_ivp
 import vinetrack as vt
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics import audit, equations
-from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import effects_on, host_for
-from vinetrack.dynamics.simulate import simulate_many
+from vinetrack.dynamics.simulate import kernel, simulate_many
 from vinetrack.effects import Effect, TrialInputs, catalogue
 
 B = 6.44

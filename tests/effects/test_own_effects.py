@@ -12,7 +12,7 @@ from commanded import run
 
 import vinetrack as vt
 import vinetrack.effects as effects
-from vinetrack.dynamics.kernel import kernel
+from vinetrack.dynamics.simulate import kernel
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, State, air_drag, catalogue, find_effect, load_effect
 from vinetrack.effects._catalogue import _RIG, _STATE, behaviour_faults, own_effects
 

@@ -24,6 +24,7 @@ from vinetrack.experiment.folder import (
     planned_trial,
     read_corrections,
     read_experiment,
+    systematic_of_travel,
     trial_order,
 )
 from vinetrack.experiment.schema import COLUMNS, SHARED, with_names
@@ -36,7 +37,6 @@ from vinetrack.experiment.settings import (
     run_settings,
     setting_entries,
 )
-from vinetrack.experiment.sheet import systematic_of_travel
 from vinetrack.pipeline.workflow import model_problems
 from vinetrack.tracks.importers import load_track, read_track
 from vinetrack.video.survey import in_no_row

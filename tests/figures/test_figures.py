@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from vinetrack.core.records import Track
 from vinetrack.figures import damping_figures, motion_figures
-from vinetrack.figures import diagnosis_figures as figures
+from vinetrack.figures import model_figures as figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.motion_figures import TRACKED, ClipView, draw_strip
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, SKY, VERMILLION, look, render

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.pipeline.stages import Job
-from vinetrack.pipeline.trials import fit_damping
+from vinetrack.pipeline.analysis import fit_damping
+from vinetrack.pipeline.workflow import Job
 
 
 def run(*arguments: object) -> Result:

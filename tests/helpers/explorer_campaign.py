@@ -19,9 +19,9 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.__main__ import main as grow
-from vinetrack.pipeline.model_stage import fit_model
-from vinetrack.pipeline.stages import Job
-from vinetrack.results.folder_layout import Results
+from vinetrack.pipeline.analysis import fit_model
+from vinetrack.pipeline.workflow import Job
+from vinetrack.results import Results
 
 DEMO_SHEET = Path(__file__).parents[2] / "data" / "demo" / "trials.csv"
 SETTINGS = "# what all trials share\ncapture_fps: 1069\nyield_pressure_kPa: 3   # from a slow ramp\nchamber_l: 2\n"

@@ -10,7 +10,7 @@ from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
+from vinetrack.laboratory.campaigns import GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 FORCES = {

@@ -8,7 +8,7 @@ from grown import Pairs, pairs_of
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import campaign, isometric_vine
+from vinetrack.laboratory.campaigns import campaign, isometric_vine
 
 
 def sheet(payload_g: float = 0.0) -> list[Trial]:

@@ -9,7 +9,7 @@ from by_hand import followed
 
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import Vine
+from vinetrack.laboratory.campaigns import Vine
 from vinetrack.tracks.position_noise import ar1_noise
 
 FPS = 1000.0

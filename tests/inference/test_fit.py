@@ -29,7 +29,7 @@ from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.inference.trial_effects import trial_costs
-from vinetrack.interface.loaded import ERROR_COLUMNS
+from vinetrack.interface import ERROR_COLUMNS
 from vinetrack.tracks.position_noise import rest_points
 
 

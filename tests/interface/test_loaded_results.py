@@ -18,7 +18,7 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.core.units import number
 from vinetrack.narrative.verdict_text import estimate_text, verdict_table
 from vinetrack.pages.page import open_campaign
-from vinetrack.results.folder_layout import ResultsError
+from vinetrack.results import ResultsError
 
 ROOT = Path(__file__).parents[2]
 

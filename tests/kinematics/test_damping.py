@@ -19,8 +19,8 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics import damping
 from vinetrack.kinematics.damping import fit_damping, fit_laws, fit_scaling, fit_trends
 from vinetrack.kinematics.summary import CONDITION_COLUMNS, look_at_motions, redo_damping
-from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, isometric_vine
-from vinetrack.laboratory.tracks import campaign as of_vine
+from vinetrack.laboratory.campaigns import GroundTruth, damping_values, grow, isometric_vine
+from vinetrack.laboratory.campaigns import campaign as of_vine
 from vinetrack.paper.published import DAMPING_B, DIAMETER_MM, EXPONENT, THICKNESS_UM
 
 N = 0.37

@@ -17,7 +17,7 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics import steady as module
 from vinetrack.kinematics import summary
 from vinetrack.kinematics.steady import Release, SteadyForce, TrialMotion, Window, find_release, flag_rest
-from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.kinematics.summary import estimate_kinematics
 
 AREA = math.pi * 0.012**2
 FILM = 1200 * math.pi * 0.024 * 200e-6

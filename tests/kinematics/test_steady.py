@@ -12,8 +12,7 @@ from vinetrack.core.records import plain_track
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.experiment.settings import RunSettings, SteadySettings
 from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
-from vinetrack.kinematics.summary import TrialResult, summarise_trial
-from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
+from vinetrack.kinematics.summary import TrialResult, estimate_kinematics, fit_all_windows, summarise_trial
 
 SEEDS, LIMITS = range(1000, 1010), SteadySettings()
 STEADY = [scaled(1, 0.2), scaled(1, 3.0), scaled(2, 1.0), scaled(3, 5.0), scaled(4, 3.0)]

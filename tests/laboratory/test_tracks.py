@@ -18,11 +18,19 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory import tracks
-from vinetrack.laboratory.filming import make_filming, recording_experiment, render_recording
+from vinetrack.laboratory import campaigns
+from vinetrack.laboratory.campaigns import (
+    GroundTruth,
+    campaign,
+    damping_values,
+    grow,
+    isometric_vine,
+    make_filming,
+    recording_experiment,
+    render_recording,
+)
 from vinetrack.laboratory.render import FrameRenderer
 from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Tube, preset
-from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
 from vinetrack.tracks.importers import load_track
 
 ROOT = Path(__file__).parents[2]
@@ -40,7 +48,7 @@ EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 
 def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others():
-    def same(one: tracks.VirtualTrial, other: tracks.VirtualTrial) -> bool:
+    def same(one: campaigns.VirtualTrial, other: campaigns.VirtualTrial) -> bool:
         moved = np.array_equal(one.track.lead_position_m, other.track.lead_position_m)
         return moved and (one.release_s, one.true) == (other.release_s, other.true)
 
@@ -116,7 +124,7 @@ def test_a_recorded_pressure_is_what_drove_it_and_noise():
 
 def test_what_is_written_reads_back_without_a_word(tmp_path):
     grown = grow(few(), nature(seed=1, trace_sigma_kPa=0.05))
-    tracks.write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
+    campaigns.write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
     assert check_experiment(tmp_path / "e") == []
     experiment = read_experiment(tmp_path / "e", strict=True)
     for trial, one in zip(experiment.trials, grown, strict=True):
@@ -136,7 +144,7 @@ def test_the_papers_nature_has_the_printed_numbers():
     """B of a printed diameter is in proportion to the wall; of the 25 mm vine it is 6.44 × ½ × (25/24)^0.75 = 3.320."""
     trials = read_experiment(PAPER).trials
     assert len(trials) == 365
-    hidden = tracks.read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
+    hidden = campaigns.read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
     B = hidden.values["eversion_damping.B"]
     assert hidden.values["eversion_damping.n"] == 0.37
     assert set(B) == {trial.vine for trial in trials}

@@ -31,11 +31,11 @@ from vinetrack.diagnosis.ladder import compare
 from vinetrack.effects import Parameter, remember
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
-from vinetrack.laboratory.tracks import grow, read_ground_truth
+from vinetrack.laboratory.campaigns import grow, read_ground_truth
 from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server, suspects
 from vinetrack.pages.plots import RecordingView, decode, recording_view
-from vinetrack.results.folder_layout import Results, ResultsError
+from vinetrack.results import Results, ResultsError
 from vinetrack.video.axis import Axis
 
 GAMMA = "size_reservoir_depletion.gamma"

@@ -17,11 +17,11 @@ from test_pipeline import MODEL_HEADERS
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.figures.registry import figures_of
-from vinetrack.laboratory import tracks
+from vinetrack.laboratory import campaigns
 from vinetrack.pipeline import planning_stage
 from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
-from vinetrack.pipeline.stages import STAGES
-from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result
+from vinetrack.pipeline.workflow import STAGES
+from vinetrack.results import Results, measured_trials, read_json, read_result
 
 TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m\n"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -215,9 +215,9 @@ def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_no
     experiment, results = tmp_path / "part", tmp_path / "results"
     trials = [trial for trial in read_experiment(ROOT / "data" / "paper").trials if trial.name in CHOSEN]
     assert len(trials) == len(CHOSEN)
-    nature = tracks.read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
+    nature = campaigns.read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
     settings = "chamber_l: 3.7\npublished: simulated\ncandidates: [air_drag]\n"
-    tracks.write_experiment(tracks.grow(trials, nature), experiment, settings)
+    campaigns.write_experiment(campaigns.grow(trials, nature), experiment, settings)
     settings = ("--settings", '{"damping": {"resamples": 100}, "figures": {"formats": ["svg"], "dpi": 60}}')
     for stage in STAGES:
         said = succeed(stage, experiment, results, *settings)

@@ -21,11 +21,11 @@ from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import published
-from vinetrack.pipeline.model_stage import all_steps, propose_effect, sheet_contradictions, with_contradictions
+from vinetrack.pipeline.analysis import all_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.report import build
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_source_experiment
+from vinetrack.results import Results, ResultsError, read_diagnosis, read_fit, read_source_experiment
 
 
 def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path):

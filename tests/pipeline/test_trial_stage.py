@@ -23,11 +23,11 @@ from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.motion_figures import TRACKED, ClipView, draw_strip
 from vinetrack.figures.style import SKY, VERMILLION
 from vinetrack.pipeline import report_stage
-from vinetrack.pipeline.stages import Job, Kept, map_unordered
-from vinetrack.pipeline.trials import analyse_trials
-from vinetrack.report import clips
-from vinetrack.report.clips import write_clip
-from vinetrack.results.folder_layout import Results, read_result
+from vinetrack.pipeline.analysis import analyse_trials
+from vinetrack.pipeline.workflow import Job, Kept, map_unordered
+from vinetrack.report import build as clips
+from vinetrack.report.build import write_clip
+from vinetrack.results import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import NO_GROWTH, Tracking
 
@@ -128,7 +128,7 @@ def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked, tmp_path):
 # Workers of a pool: they answer in any order, and end with the process that started them, however it ends.
 PARENT = """
 import os, sys, time
-from vinetrack.pipeline.stages import map_unordered
+from vinetrack.pipeline.workflow import map_unordered
 
 def task(number):
     os.write(1, b"%d\\n" % os.getpid())  # at once: two that print mix their lines
@@ -298,7 +298,7 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
         drawn.append(np.array([edge.along_px[frame] for edge in view.edges]))
         return np.repeat(picture[:, :, None], 3, axis=2)
 
-    monkeypatch.setattr("vinetrack.report.clips.compose", seen)
+    monkeypatch.setattr("vinetrack.report.build.compose", seen)
     report_stage.overlay_one(results, "a", seconds=2)
     path, shake_px = results / "analysed" / "a.json", 2.0 * np.sin(np.arange(N))
     content = json.loads(path.read_text())

@@ -12,15 +12,15 @@ import pytest
 from hand_sheet import one_vine
 from test_pipeline import write_campaign
 
+import vinetrack.results as origin
 from vinetrack.cli import main as commands
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.stages import STAGES
-from vinetrack.results import folder_layout as origin
-from vinetrack.results.folder_layout import TRIALS_COLUMNS, Results, table_of
+from vinetrack.pipeline.workflow import STAGES
+from vinetrack.results import TRIALS_COLUMNS, Results, table_of
 from vinetrack.tracks.frame_timing import longer_than_stated
 
 ROOT = Path(__file__).parents[2]
@@ -239,7 +239,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
 BEGIN = """
 import time
 from pathlib import Path
-from vinetrack.results.folder_layout import begin_run
+from vinetrack.results import begin_run
 lock = begin_run(Path("results/vines"), Path("vines"))
 print("begun", flush=True)
 time.sleep(60)

@@ -18,13 +18,13 @@ from PIL import Image
 
 from vinetrack.diagnosis.result import PROBABILITIES, Candidate, Diagnosis, EffectPower, Power
 from vinetrack.effects import catalogue
-from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
+from vinetrack.figures.model_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import SECTIONS, figures_of
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.rows import SIMULATED
 from vinetrack.report import build
-from vinetrack.report.clips import write_clip
+from vinetrack.report.build import write_clip
 
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501

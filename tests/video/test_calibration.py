@@ -9,7 +9,7 @@ import pytest
 from plain_scene import write_video
 
 from vinetrack.experiment.settings import Charuco, Checkerboard, TwoPoints
-from vinetrack.laboratory.filming import render_target
+from vinetrack.laboratory.campaigns import render_target
 from vinetrack.laboratory.scene import Camera, Target, preset
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures, find_board, fit_plane

@@ -19,9 +19,8 @@ from tracking_accuracy import film as rendered_film
 from vinetrack.core.records import FLAGS, Correction, Track, Trial, with_flag
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.__main__ import DEMO
-from vinetrack.laboratory.filming import film, make_filming, render_recording
+from vinetrack.laboratory.campaigns import film, grow, make_filming, read_ground_truth, render_recording
 from vinetrack.laboratory.scene import preset
-from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video import edge, track
 from vinetrack.video import edge_kernels as kernels

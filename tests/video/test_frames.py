@@ -18,11 +18,10 @@ from camera_files import write_cine, write_mraw, write_side_file
 from plain_scene import Plan, plain_scene, write_images, write_video
 
 from vinetrack.core.records import Track, Trial, with_flag
-from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.campaigns import Filming, GroundTruth, film, grow
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
-from vinetrack.laboratory.tracks import GroundTruth, grow
-from vinetrack.report.clips import write_clip
+from vinetrack.report.build import write_clip
 from vinetrack.video import frames as module
 from vinetrack.video import small_pictures
 from vinetrack.video.axis import Axis

@@ -10,7 +10,7 @@ from plain_scene import write_video
 
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.experiment.folder import check_experiment, read_experiment
-from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.campaigns import render_recording
 from vinetrack.laboratory.scene import Tube, preset
 from vinetrack.video import survey as module
 from vinetrack.video.axis import askew_trials

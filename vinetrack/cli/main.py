@@ -28,13 +28,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import vinetrack.results as layout
 from vinetrack.core.problems import ExperimentError, InputError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, safe_join, write_csv, write_json, write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.experiment.schema import COLUMNS, Column, option
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.stages import STAGES, Job, Stage, compilation_told
-from vinetrack.results import folder_layout as layout
+from vinetrack.pipeline.workflow import STAGES, Job, Stage, compilation_told
 
 if TYPE_CHECKING:
     from vinetrack.effects import Effect
@@ -309,7 +309,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
     from vinetrack.kinematics.summary import look_at_motions
-    from vinetrack.pipeline.model_stage import diagnosed, write_diagnosis
+    from vinetrack.pipeline.analysis import diagnosed, write_diagnosis
 
     results = layout.Results(target)
     if results.provenance.exists():
@@ -357,7 +357,7 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
 @command()
 def _propose(results: Path, experiment: Path | None, report: Say) -> Answer:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
-    from vinetrack.pipeline.model_stage import propose_effect
+    from vinetrack.pipeline.analysis import propose_effect
 
     lines, files = propose_effect(layout.read_source_experiment(results, experiment), results, report)
     return lines, {"lines": lines, "files": files}

@@ -72,4 +72,4 @@ class Drawn:
 
     def plot(self, name: str = "", **options: Any) -> Figure:
         """Return a figure of the report by its name; blank for the main one."""
-        return cast("Figure", import_module("vinetrack.interface.loaded").figure_of(self, name, **options))
+        return cast("Figure", import_module("vinetrack.interface").figure_of(self, name, **options))

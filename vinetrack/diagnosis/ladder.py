@@ -37,8 +37,7 @@ from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
-from vinetrack.kinematics.summary import lead_velocity_at
-from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.kinematics.summary import estimate_kinematics, lead_velocity_at
 from vinetrack.tracks.position_noise import rest_points
 
 # ------------------------------------------------------------------------------

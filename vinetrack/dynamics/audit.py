@@ -17,14 +17,14 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.kernel import Trace
 from vinetrack.dynamics.model import Model, check_needs, effects_on
+from vinetrack.dynamics.simulate import Trace
 from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, catalogue
 
 # ------------------------------------------------------------------------------
 # Forces, pressure and masses of a model along a known motion, effect by effect.
 #
-# The same order of physics as in the compiled kernel (`vinetrack.dynamics.kernel`), in plain Python on arrays; a test
+# The same order of physics as in the compiled kernel (`vinetrack.dynamics.simulate`), in plain Python on arrays; a test
 # compares the two.
 
 

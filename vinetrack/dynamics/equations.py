@@ -1,6 +1,6 @@
 """The interface of the integrator to one model and one trial: compiled functions and the arrays that they use.
 
-`vinetrack.dynamics.kernel` writes the functions of one model as a module, the first argument `equations` of the
+`vinetrack.dynamics.simulate` writes the functions of one model as a module, the first argument `equations` of the
 integrator. Numba has a type for each module, so that the integrator is compiled for each model and the calls can be
 inlined. Unless stated they take `(time, x, v, chamber, trial)`: x, v are position and speed of the tail, m and m/s,
 `chamber` is the gauge pressure of the chamber, Pa.

@@ -254,7 +254,7 @@ class SteadySettings(_Strict):
 
 
 class VelocitySettings(_Strict):
-    """How positions become velocities; see `vinetrack.kinematics.velocity`."""
+    """How positions become velocities; see `vinetrack.kinematics.summary`."""
 
     kappa: Positive = 3.0
     """The smoothing window is the widest that agrees with all narrower ones within this many standard errors."""

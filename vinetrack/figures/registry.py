@@ -20,7 +20,7 @@ import numpy as np
 from vinetrack.core.units import pressure_text
 from vinetrack.figures.style import look
 from vinetrack.narrative.verdict_text import listed_names
-from vinetrack.results.folder_layout import Results, read_diagnosis, read_json, read_result, table_of
+from vinetrack.results import Results, read_diagnosis, read_json, read_result, table_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,7 +70,7 @@ def figure(name: str, section: str, title: str, *, data: str = "") -> Callable[[
 @cache
 def all_figures() -> dict[str, RegisteredFigure]:
     """Return all figures by name."""
-    from vinetrack.figures import damping_figures, diagnosis_figures, motion_figures  # noqa: F401 - each registers its own
+    from vinetrack.figures import damping_figures, model_figures, motion_figures  # noqa: F401 - each registers its own
 
     return dict(_registered)
 

@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.equations import ENDED
-from vinetrack.dynamics.kernel import Batch, Trace, lay_out, starts_of
 from vinetrack.dynamics.model import Model, check_needs, with_pressures
 from vinetrack.dynamics.simulate import (
+    Batch,
     SimulationError,
+    Trace,
     Trajectory,
     bends_of,
     check_completed,
+    lay_out,
+    starts_of,
     trajectories,
 )
 from vinetrack.effects import TrialInputs

@@ -19,8 +19,16 @@ from pathlib import Path
 import yaml
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.filming import compile_the_tracker, film, make_filming, picture_target, recording_experiment
-from vinetrack.laboratory.tracks import grow, read_ground_truth, write_tracks
+from vinetrack.laboratory.campaigns import (
+    compile_the_tracker,
+    film,
+    grow,
+    make_filming,
+    picture_target,
+    read_ground_truth,
+    recording_experiment,
+    write_tracks,
+)
 
 DEMO = Path(__file__).with_name("demo.yaml")
 

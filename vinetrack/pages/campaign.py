@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import pandas as pd
 
+import vinetrack.results as layout
 from vinetrack.core.problems import UserError, reasons_told
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import THREAD_PREFIX, in_one_blas_thread
@@ -29,7 +30,6 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.results import folder_layout as layout
 
 
 @dataclass(frozen=True)

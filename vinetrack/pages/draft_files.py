@@ -19,10 +19,9 @@ from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.records import CONTAINERS, IMAGES, Correction
 from vinetrack.core.units import UNITS, convert, other_units, split_unit
-from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
+from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, SHEET, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and_unit
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.experiment.sheet import SHEET
 from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.tracks.importers import read_track
 from vinetrack.video.survey import entries, is_calibration, list_recordings, natural_order

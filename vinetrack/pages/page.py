@@ -49,7 +49,7 @@ from vinetrack.pages.draft_files import save_model
 from vinetrack.pages.local_page import TEMPLATES, PageServer, page_frame
 from vinetrack.pipeline.workflow import command_for_results
 from vinetrack.report.build import TOKENS, beyond_adequate, next_experiment
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
+from vinetrack.results import Results, ResultsError, read_diagnosis
 
 # ------------------------------------------------------------------------------
 # Numbers and words of the text panels, which `panels.html` lays out.

@@ -28,8 +28,8 @@ from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import TEMPLATES, jpeg
-from vinetrack.report.clips import position_to_px, shake_along
-from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.report.build import position_to_px, shake_along
+from vinetrack.results import Results, ResultsError, read_json, read_result
 from vinetrack.video.axis import Axis, axis_from_entry
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 

@@ -27,16 +27,23 @@ from vinetrack.core.records import Correction
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join
 from vinetrack.core.threads import THREAD_PREFIX
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
-from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experiment, read_corrections
+from vinetrack.experiment.folder import (
+    CORRECTIONS_FILE,
+    REQUIRED_COLUMNS,
+    SETTINGS,
+    SHEET,
+    check_experiment,
+    make_trial,
+    read_corrections,
+    read_row,
+)
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
-from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
 from vinetrack.figures.motion_figures import draw_strip
 from vinetrack.figures.style import render
 from vinetrack.pages import draft_files as files
 from vinetrack.pages.local_page import TEMPLATES, TOKENS_CSS, PageServer, jpeg, page_frame
-from vinetrack.pipeline.stages import identity
-from vinetrack.pipeline.workflow import check_folder
+from vinetrack.pipeline.workflow import check_folder, identity
 from vinetrack.report.build import TOKENS, base64_uri
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
 from vinetrack.video.axis import Axis, axis_entry, axis_through, find_growth_axis

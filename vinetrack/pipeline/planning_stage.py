@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+import vinetrack.results as layout
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import PROVENANCE, write_csv
@@ -27,17 +28,17 @@ from vinetrack.diagnosis.result import ADEQUATE, Power, PowerInput, SimulatedRat
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS, catalogue
 from vinetrack.experiment import folder as experiments
+from vinetrack.experiment.folder import YIELD_SIGMA_KPA, systematic_of_travel
 from vinetrack.experiment.schema import COLUMNS, option, read_range
 from vinetrack.experiment.settings import Limits, read_experiment_settings
-from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, systematic_of_travel
-from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
+from vinetrack.figures.model_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import write_figure
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import trial_text, value_in_unit, volume_text
-from vinetrack.pipeline.stages import map_unordered
+from vinetrack.pipeline.workflow import map_unordered
 from vinetrack.planning import prediction as vines
 from vinetrack.planning.predictive_inputs import (
     YIELD,
@@ -48,7 +49,6 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
     read_sizes,
 )
-from vinetrack.results import folder_layout as layout
 
 # ------------------------------------------------------------------------------
 # Inputs of the commands: options or a sheet, a fit, effects.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+import vinetrack.results as layout
 from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
@@ -25,11 +26,8 @@ from vinetrack.experiment.settings import ExperimentSettings, FigureSettings, Ov
 from vinetrack.figures.registry import FigureTables, draw, figures_of
 from vinetrack.figures.style import render
 from vinetrack.paper import rows as paper
-from vinetrack.pipeline.stages import Job, map_unordered
-from vinetrack.pipeline.workflow import SHARED_FILES, input_files
-from vinetrack.report.build import build_report, report_content, tally
-from vinetrack.report.clips import recording_facts, write_overlay, write_recording
-from vinetrack.results import folder_layout as layout
+from vinetrack.pipeline.workflow import SHARED_FILES, Job, input_files, map_unordered
+from vinetrack.report.build import build_report, recording_facts, report_content, tally, write_overlay, write_recording
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.survey import measure_recording
 

@@ -24,8 +24,8 @@ from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
+from vinetrack.experiment.folder import SHEET
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
-from vinetrack.experiment.sheet import SHEET
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate

@@ -27,14 +27,22 @@ from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue
 from vinetrack.experiment import folder as experiments
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
-from vinetrack.figures.prediction_figures import draw_power
+from vinetrack.figures.model_figures import draw_power
 from vinetrack.figures.registry import FigureTables, describe_conditions, draw, figures_of, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.results import folder_layout
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.results import (
+    Results,
+    ResultsError,
+    measured_trials,
+    read_diagnosis,
+    read_fit,
+    read_json,
+    read_result,
+    read_source_experiment,
+)
 from vinetrack.tracks.importers import flag_end_of_motion, table_track
 
 if TYPE_CHECKING:
@@ -63,7 +71,7 @@ class LoadedResults(Printed, Drawn):
     @cached_property
     def experiment(self) -> experiments.Experiment:
         """The experiment that the results were made from; raises a ResultsError if it has moved."""
-        return folder_layout.read_source_experiment(self.folder)
+        return read_source_experiment(self.folder)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
@@ -172,7 +180,7 @@ def load(folder: Path | str) -> LoadedResults:
     >>> import vinetrack as vt
     >>> vt.load("nowhere")
     Traceback (most recent call last):
-    vinetrack.results.folder_layout.ResultsError: nowhere is not a results folder, ...
+    vinetrack.results.ResultsError: nowhere is not a results folder, ...
     """
     folder = Path(folder)
     if not Results(folder).provenance.exists():
@@ -281,8 +289,8 @@ def read_source(
     if isinstance(source, pd.DataFrame):
         return tracks_from_frame(source), None, {}
     if isinstance(source, (str, Path)) and tracks is None and (Path(source) / PROVENANCE).exists():
-        experiment = folder_layout.read_source_experiment(Path(source))
-        pairs = folder_layout.measured_trials(experiment, Results(Path(source)))
+        experiment = read_source_experiment(Path(source))
+        pairs = measured_trials(experiment, Results(Path(source)))
         return pairs, experiment, {**experiment.failed, **experiment.left_out}
     if isinstance(source, (str, Path)):
         source = experiments.read_experiment(source)
@@ -299,7 +307,7 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     one; `trial` for figures of one trial. A ResultsError if there is no such figure.
     """
     if isinstance(shown, LoadedResults):
-        from vinetrack.pipeline.trials import draw_trial
+        from vinetrack.pipeline.analysis import draw_trial
 
         if name == "trial_motion":
             if trial not in (names := list(shown.trials["trial"])):
@@ -347,7 +355,7 @@ def _described(trials: Sequence[Trial]) -> pd.DataFrame:
 def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     """The tables of a diagnosis as a results folder would hold them."""
     from vinetrack.figures.registry import CURVE_COLUMNS, DiagnosisTables
-    from vinetrack.pipeline.model_stage import diagnosis_tables, predictions
+    from vinetrack.pipeline.analysis import diagnosis_tables, predictions
 
     curves = []
     for one, table in predictions(shown.fits[0], shown.fits[-1]) if shown.fits else ():
@@ -535,5 +543,5 @@ def example_tracks() -> pd.DataFrame:
     >>> vt.example_tracks()["trial"].nunique()
     8
     """
-    with (files("vinetrack.interface") / "example_tracks.csv").open(encoding="utf-8") as file:
+    with (files("vinetrack") / "example_tracks.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file)

@@ -1,1 +1,0 @@
-"""The Python interface: load, fit, diagnose and compare, for trials from any source."""

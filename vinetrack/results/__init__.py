@@ -1,1 +1,0 @@
-"""Results folders: names and content of the files, and reading them."""
