@@ -23,7 +23,7 @@ from tracking_accuracy import CAPTURE_FPS, approach
 from vinetrack.core.records import Trial
 from vinetrack.laboratory.campaigns import render_recording
 from vinetrack.laboratory.scene import preset
-from vinetrack.video.frames import DECODER_THREADS, read_frames
+from vinetrack.video.frames import read_frames
 from vinetrack.video.track import track_frames, track_recording
 
 
@@ -32,7 +32,7 @@ def decode_only(path: Path) -> int:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        stream.codec_context.thread_count = DECODER_THREADS
+        stream.codec_context.thread_count = 0  # as FFmpeg chooses
         return sum(1 for _ in container.decode(stream))
 
 
@@ -41,7 +41,7 @@ def to_grey(path: Path) -> int:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        stream.codec_context.thread_count = DECODER_THREADS
+        stream.codec_context.thread_count = 0  # as FFmpeg chooses
         return sum(frame.to_ndarray(format="gray").shape[0] > 0 for frame in container.decode(stream))
 
 

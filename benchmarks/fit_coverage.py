@@ -33,7 +33,7 @@ from vinetrack.core.units import AIR_DENSITY_KG_M3, BASE_EFFECTS, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.campaigns import GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
-from vinetrack.paper.published import CHAMBER_L
+from vinetrack.paper.motions import CHAMBER_L
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"

@@ -5,7 +5,7 @@
 Each recording draws the tube's width (12 to 60 px) and growth (90 to 600 px), the door's length (0.4 to 1.4 times the
 growth, 200 px at most), brightness, swing and where it comes to rest (80 to 140 degrees: below 90 it lies across the
 tube and hides it), the direction of growth, speed (1.5 to 30 px a frame), payload, picture and bit rate.
-What counts as growth (`video/small_pictures.py`) was chosen on seeds 71001 to 71040 (`tune`), 73001 to 73040 and 75001
+What counts as growth (`video/axis.py`) was chosen on seeds 71001 to 71040 (`tune`), 73001 to 73040 and 75001
 to 75040; the first path of the front (`video/edge.py`) on 71001 to 71120; 72001 to 72120 were looked at along the way,
 each forty after they had counted once. The table that counts is of other seeds from 72121 up.
 

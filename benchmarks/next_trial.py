@@ -28,8 +28,8 @@ import numpy as np
 from rich.progress import track
 
 import vinetrack as vt
+from vinetrack.core.process import table
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.terminal import table
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis.further_trials import NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names

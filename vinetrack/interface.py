@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.process import Drawn, Printed
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import Drawn, Printed
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.result import Diagnosis, Power

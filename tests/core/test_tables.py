@@ -12,9 +12,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, InputError
+from vinetrack.core.process import in_one_blas_thread, njit, progress, waiting
 from vinetrack.core.tables import parse_number, parse_table, parse_yaml, safe_join
-from vinetrack.core.terminal import progress, waiting
-from vinetrack.core.threads import in_one_blas_thread, njit
 from vinetrack.core.units import UNITS, convert, interval, number, split_unit, with_error, with_interval
 from vinetrack.dynamics.simulate import _cache_folder
 from vinetrack.pages.draft_files import save_model, with_value

@@ -19,16 +19,6 @@ from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory import campaigns
-from vinetrack.laboratory.campaigns import (
-    GroundTruth,
-    campaign,
-    damping_values,
-    grow,
-    isometric_vine,
-    make_filming,
-    recording_experiment,
-    render_recording,
-)
 from vinetrack.laboratory.render import FrameRenderer
 from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Tube, preset
 from vinetrack.tracks.importers import load_track
@@ -37,11 +27,11 @@ ROOT = Path(__file__).parents[2]
 
 
 def few() -> list[Trial]:
-    return list(with_names(campaign(isometric_vine(4), (14, 20, 28), 2, prefix="R4_")))
+    return list(with_names(campaigns.campaign(campaigns.isometric_vine(4), (14, 20, 28), 2, prefix="R4_")))
 
 
-def nature(**changes: object) -> GroundTruth:
-    return GroundTruth(values=damping_values(few()), **changes)  # type: ignore[arg-type]
+def nature(**changes: object) -> campaigns.GroundTruth:
+    return campaigns.GroundTruth(values=campaigns.damping_values(few()), **changes)  # type: ignore[arg-type]
 
 
 EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
@@ -53,32 +43,34 @@ def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_se
         return moved and (one.release_s, one.true) == (other.release_s, other.true)
 
     trials, hidden = few(), nature(seed=5, yield_error_kPa=0.2)
-    whole = grow(trials, hidden)
-    rest = grow([trial for i, trial in enumerate(trials) if i != 3], hidden)
+    whole = campaigns.grow(trials, hidden)
+    rest = campaigns.grow([trial for i, trial in enumerate(trials) if i != 3], hidden)
     assert all(map(same, whole[:3] + whole[4:], rest))
-    assert not any(map(same, whole, grow(trials, replace(hidden, seed=4))))
+    assert not any(map(same, whole, campaigns.grow(trials, replace(hidden, seed=4))))
 
 
 def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_origin():
     hidden = nature(seed=1, **EXACT)
-    for grown in grow(few(), hidden):
+    for grown in campaigns.grow(few(), hidden):
         truth = simulate(hidden.model(), grown.stated, grown.track.time_s - grown.release_s)
         np.testing.assert_allclose(grown.track.lead_position_m - grown.origin_m, truth.lead_position_m, atol=1e-12)
         assert grown.true == grown.stated
         assert -0.05 <= grown.origin_m <= 0.05
         np.testing.assert_allclose(np.diff(grown.track.time_s), 1 / 1069, rtol=1e-9)
     # A hidden effect of the measurement shows in the track and not in the truth.
-    values = {**damping_values(few()), "length_scale.eps": 0.05}
-    wrong = GroundTruth(effects=(*GroundTruth().effects, "length_scale"), values=values, seed=1, **EXACT)
-    (grown,) = grow(few()[:1], wrong)
+    values = {**campaigns.damping_values(few()), "length_scale.eps": 0.05}
+    wrong = campaigns.GroundTruth(
+        effects=(*campaigns.GroundTruth().effects, "length_scale"), values=values, seed=1, **EXACT
+    )
+    (grown,) = campaigns.grow(few()[:1], wrong)
     seen_m = grown.track.lead_position_m - grown.origin_m
     np.testing.assert_allclose(seen_m, 1.05 * grown.true_lead_position_m, atol=1e-12)
 
 
 def test_scatter_of_damping_and_pressure_is_as_stated():
     """Standard deviations of 600 draws are good to 3 % (one sigma); the two do not go together."""
-    trials = list(with_names(campaign(isometric_vine(4), (28,), 600)))
-    grown = grow(trials, nature(seed=7, longest_frames=50, release_frames=(15, 40)))
+    trials = list(with_names(campaigns.campaign(campaigns.isometric_vine(4), (28,), 600)))
+    grown = campaigns.grow(trials, nature(seed=7, longest_frames=50, release_frames=(15, 40)))
     column = grown[0].model.parameter_names.index("eversion_damping.B")
     B = np.array([one.model.parameters_of(one.true)[column] for one in grown]) / 6.44 - 1
     P = np.array([one.true.pressure_Pa for one in grown]) / 28e3 - 1
@@ -97,7 +89,7 @@ def test_noise_has_the_stated_deviation_and_correlation():
     """Rest frames alone, 4000 of them: errors of 2 % for the deviation (or more), 0.016 for the latter."""
     at_rest = {"release_frames": (4000, 4000), "longest_frames": 4000}
     hidden = nature(seed=11, noise_m=2e-4, noise_correlation=0.6, **at_rest)
-    noise = grow(few()[:1], hidden)[0]
+    noise = campaigns.grow(few()[:1], hidden)[0]
     assert (noise.true_lead_position_m == 0).all()
     residual = noise.track.lead_position_m - noise.origin_m
     assert residual.std() == pytest.approx(2e-4, rel=0.08)
@@ -109,21 +101,21 @@ def test_noise_has_the_stated_deviation_and_correlation():
 
 def test_a_recorded_pressure_is_what_drove_it_and_noise():
     trials = [replace(trial, chamber_m3=1e-3) for trial in few()]
-    effects = (*GroundTruth().effects, "reservoir_depletion")
-    values = {**damping_values(trials), "reservoir_depletion.gamma": 1.0}
-    quiet = GroundTruth(effects=effects, values=values, trace_sigma_kPa=0.0, seed=1)
-    calm = grow(trials, quiet)
+    effects = (*campaigns.GroundTruth().effects, "reservoir_depletion")
+    values = {**campaigns.damping_values(trials), "reservoir_depletion.gamma": 1.0}
+    quiet = campaigns.GroundTruth(effects=effects, values=values, trace_sigma_kPa=0.0, seed=1)
+    calm = campaigns.grow(trials, quiet)
     for grown in calm:
         volume = 1e-3 + math.pi * 0.012**2 * grown.true_lead_position_m
         truth = (grown.true.pressure_Pa + 101_325) * 1e-3 / volume - 101_325
         np.testing.assert_allclose(grown.track.pressure_Pa, truth, rtol=1e-9)
         assert truth[0] - truth[-1] > 1e3
-    loud = grow(trials[:1], replace(quiet, trace_sigma_kPa=0.1))[0]
+    loud = campaigns.grow(trials[:1], replace(quiet, trace_sigma_kPa=0.1))[0]
     assert np.std(loud.track.pressure_Pa - calm[0].track.pressure_Pa) == pytest.approx(100, rel=0.3)
 
 
 def test_what_is_written_reads_back_without_a_word(tmp_path):
-    grown = grow(few(), nature(seed=1, trace_sigma_kPa=0.05))
+    grown = campaigns.grow(few(), nature(seed=1, trace_sigma_kPa=0.05))
     campaigns.write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
     assert check_experiment(tmp_path / "e") == []
     experiment = read_experiment(tmp_path / "e", strict=True)
@@ -155,8 +147,8 @@ def test_the_papers_nature_has_the_printed_numbers():
 
 
 def test_tracks_are_put_before_a_camera_on_request(tmp_path):
-    filming = make_filming({"target": {"squares": [14, 5], "square_m": 0.015, "marker_m": 0.011}})
-    filmed = recording_experiment(read_experiment(PAPER), filming, tmp_path / "filmed")
+    filming = campaigns.make_filming({"target": {"squares": [14, 5], "square_m": 0.015, "marker_m": 0.011}})
+    filmed = campaigns.recording_experiment(read_experiment(PAPER), filming, tmp_path / "filmed")
     assert [trial.name for trial in filmed.trials] == [trial.name for trial in read_experiment(PAPER).trials]
     for trial in filmed.trials:
         assert trial.video == tmp_path / "filmed" / "videos" / f"{trial.name}.mp4"
@@ -164,7 +156,7 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path):
         assert trial.exposure_s == pytest.approx(0.1 / 1069, rel=1e-4)
     assert filmed.settings.calibration.square_mm == pytest.approx(15)
     with pytest.raises(ValueError, match="recordings already"):
-        recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
+        campaigns.recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
 
 
 def test_a_ball_falls_as_the_equation_of_motion_has_it():
@@ -381,7 +373,7 @@ def test_same_seed_same_pictures_other_seed_others():
 def test_h264_holds_every_frame_at_the_rendered_levels_in_the_limited_range(tmp_path):
     scene = replace(preset("demo"), camera=Camera(width_px=320, height_px=128), encoding=Encoding(gop=8))
     shot = {"n_frames": 24, "capture_fps": 1069.0, "seed": 7}
-    truth = render_recording(scene, steadily(2.0, 0.005), out_path=tmp_path / "trial.mp4", **shot)
+    truth = campaigns.render_recording(scene, steadily(2.0, 0.005), out_path=tmp_path / "trial.mp4", **shot)
     with av.open(str(tmp_path / "trial.mp4")) as container:
         assert float(container.streams.video[0].average_rate) == pytest.approx(60)
         frames = list(container.decode(video=0))

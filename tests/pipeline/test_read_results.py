@@ -20,7 +20,7 @@ from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
-from vinetrack.paper import published
+from vinetrack.paper import motions
 from vinetrack.pipeline.analysis import all_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
@@ -215,7 +215,7 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
     vine = Trial(name="a", pressure_Pa=30e3, yield_pressure_Pa=3e3, **size)
     # A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have.
     force_N = (vine.pressure_Pa - vine.yield_pressure_Pa) * vine.area_m2
-    tail_m_s = (force_N / damping_prior(vine.diameter_m, vine.thickness_m)) ** (1 / published.EXPONENT)
+    tail_m_s = (force_N / damping_prior(vine.diameter_m, vine.thickness_m)) ** (1 / motions.PRINTED_EXPONENT)
     steady = plain_track(np.arange(40) / 1000, np.arange(40) / 1000 * tail_m_s / 2)
     results, made = Results(tmp_path), Diagnosis.from_json(diagnosis("missing"))
     right = [(replace(vine, name=name), steady) for name in "ab"]

@@ -12,14 +12,15 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment import schema, settings
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.paper import published
+from vinetrack.paper import motions
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.candidate_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
-from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TENSION, grown
+from vinetrack.planning.prediction import grown
 from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 
-FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
+EDGE, TENSION, LEAST_TENSION = "speed of the leading edge", "tension of the tail", "least tension of the tail"
+FAST = {name: str(value) for name, value in motions.FAST_VINE.items()}
 SIZES = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 VINE = dict(zip(SIZES, (24, 200, 280, 28), strict=True))
 
@@ -88,7 +89,11 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     drawn_Pa = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
     alone = [certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3) for P_y in drawn_Pa]
     speeds = [vt.predict_vine(one, samples=1).quantities[0].median for one in alone]
-    assert [prediction[EDGE].high, prediction[EDGE].median, prediction[EDGE].low] == pytest.approx(speeds, rel=2e-3)
+    assert [
+        prediction[EDGE].high,
+        prediction[EDGE].median,
+        prediction[EDGE].low,
+    ] == pytest.approx(speeds, rel=2e-3)
     (share,) = prediction.shares
     assert (share.low, share.high) == pytest.approx((prediction[EDGE].low, prediction[EDGE].high), rel=0.03)
 
@@ -188,17 +193,17 @@ def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):
 
 
 def printed(scale: int) -> tuple[float, float]:
-    return 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
+    return 1e-3 * motions.DIAMETER_MM[scale], 1e-6 * motions.THICKNESS_UM[scale]
 
 
 def test_the_guess_is_exact_for_the_largest_printed_vine_and_its_error_that_of_a_regression():
     assert damping_prior(*printed(4)) == pytest.approx(6.44)
-    for scale, B in published.DAMPING_B.items():
+    for scale, B in motions.DAMPING_B.items():
         assert damping_prior(*printed(scale)) == pytest.approx(B, rel=0.18)
     # 6.44 (R/4)^1.75 = 0.5692, 1.9146, 3.8927, 6.44 against 0.57, 1.83, 4.54, 6.44; two of four numbers are used up.
     off = np.log([0.57 / 0.5692, 1.83 / 1.9146, 4.54 / 3.8927, 1.0])
     assert guess.damping_scatter() == pytest.approx(math.sqrt(np.sum(off**2) / 2), rel=1e-3)
-    z = np.log([damping_prior(*printed(scale)) for scale in published.DAMPING_B])
+    z = np.log([damping_prior(*printed(scale)) for scale in motions.DAMPING_B])
     design = np.column_stack([np.ones(4), z])
     for size in ((25e-3, 100e-6), (2.5e-3, 50e-6), (100e-3, 400e-6)):
         row = np.array([1.0, math.log(damping_prior(*size))])
@@ -234,7 +239,7 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_no_right_one(damping, factor,
         stated = {"pressure_Pa": factor * P + added_Pa, "yield_pressure_Pa": yield_factor * 3e3}
         stated |= {"pressure_unit": "psi" if suspected == "kPa, not psi" else "kPa"}
         one = Trial(name=f"t{P:g}", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, **stated)
-        tail = ((P - 3e3) * one.area_m2 / (damping * damping_prior(0.012, 1e-4))) ** (1 / published.EXPONENT)
+        tail = ((P - 3e3) * one.area_m2 / (damping * damping_prior(0.012, 1e-4))) ** (1 / motions.PRINTED_EXPONENT)
         pairs.append((one, tail / 2))
     found = guess.pressure_problems(pairs)
     assert len(found) == bool(suspected)

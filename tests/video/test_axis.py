@@ -14,11 +14,10 @@ from plain_scene import Plan, plain_scene, write_images
 
 from vinetrack.core.records import Trial
 from vinetrack.video import axis as curves
-from vinetrack.video.axis import Axis, axis_problem, axis_through, find_axis, find_growth_axis
+from vinetrack.video.axis import Axis, SmallPictures, axis_problem, axis_through, find_axis, find_growth_axis
 from vinetrack.video.calibration import PlaneCalibration, PlaneMap
 from vinetrack.video.edge import initial_front_path
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Strip, cut_strip
 from vinetrack.video.track import hops_between_bodies, in_metres, track_frames, track_pixels, track_recording
 

@@ -24,10 +24,9 @@ from vinetrack.laboratory.scene import preset
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video import edge, track
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, SmallPictures, axis_through
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Look, Positions, Tracker, calibrated_sigma, cut_strip, steadied
 from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, moving_range, track_recording
 

@@ -23,8 +23,7 @@ from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
 from vinetrack.report.build import write_clip
 from vinetrack.video import frames as module
-from vinetrack.video import small_pictures
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import MARGIN_FRAMES, Axis, event_range, read_event
 from vinetrack.video.edge import axis_of_tube, outline
 from vinetrack.video.frames import (
     PHANTOM_TABLE,
@@ -35,7 +34,6 @@ from vinetrack.video.frames import (
     slots_from_times,
 )
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.strip import Strip, camera_unit
 from vinetrack.video.track import track_frames, track_recording
 
@@ -297,7 +295,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monke
     scene, long_frames = filmed
     film = write_video(tmp_path / "long.mp4", long_frames, options={"crf": "14", "g": key_frames})
     whole, whole_track = read_frames(film), tracked(film)
-    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    monkeypatch.setattr("vinetrack.video.axis.MAX_BYTES_WHOLE", 0)
     frames, part = read_event(inspect_recording(film)), tracked(film)
     moving = np.flatnonzero(scene.moving) + BEFORE
     assert frames.first <= moving[0] - 40
@@ -327,7 +325,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monke
 @pytest.mark.slow
 def test_of_a_long_cine_the_event_is_read_and_no_more(filmed, tmp_path, monkeypatch):
     scene, long_frames = filmed
-    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    monkeypatch.setattr("vinetrack.video.axis.MAX_BYTES_WHOLE", 0)
     missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
     deep = long_frames.astype(np.uint16) * 16
     path = write_cine(tmp_path / "long.cine", deep, rate=1000, exposure_ns=200_000, times_s=missing)

@@ -30,8 +30,8 @@ import typer
 
 import vinetrack.results as layout
 from vinetrack.core.problems import ExperimentError, InputError, UserError, format_problems
+from vinetrack.core.process import table, waiting
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, safe_join, write_csv, write_json, write_text
-from vinetrack.core.terminal import table, waiting
 from vinetrack.experiment.schema import COLUMNS, Column, option
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import STAGES, Job, Stage, compilation_told
@@ -601,7 +601,7 @@ def _exit_despite_threads(status: str | int | None) -> None:
     such a thread within compiled code, which sometimes aborts the process (status -6). Files are written atomically, so
     nothing is lost by not waiting.
     """
-    from vinetrack.core.threads import THREAD_PREFIX
+    from vinetrack.core.process import THREAD_PREFIX
 
     if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
         return

@@ -16,8 +16,8 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from vinetrack.core.problems import Remark, in_words, remark
+from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats, Track, with_flag
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.further_trials import next_experiment
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from pydantic import Field, PlainSerializer
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.linear_power import power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Products, in_noise, misfit_tests
 from vinetrack.diagnosis.result import EffectPower, FurtherTrials

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.core.process import Drawn, in_one_blas_thread, table
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
-from vinetrack.core.terminal import Drawn, table
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import number
 from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for

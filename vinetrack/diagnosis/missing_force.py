@@ -24,8 +24,8 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import (
     FittedMotion,

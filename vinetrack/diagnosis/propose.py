@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.problems import Remark, remark
+from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Track
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out_error, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from vinetrack.core.problems import Remark, in_words
+from vinetrack.core.process import Drawn, Printed
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import Drawn, Printed
 from vinetrack.inference.fit_result import Fit, Number, OrNaN, or_open
 
 if TYPE_CHECKING:

@@ -68,7 +68,14 @@ class BatchArrays(NamedTuple):
     stops: Floats  #: tail travel at the end of growth, m, shape (n_trials,); infinite if there is none
 
 
-RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
+class Status(IntEnum):
+    """How a trajectory, or a part of it with a slack tail, ends."""
+
+    RUNNING = 0
+    ENDED = 1
+    STALLED = 2
+    TOO_HARD = 3
+    TAUT = 4
 
 
 class Asked(IntEnum):

@@ -17,14 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vinetrack.dynamics.equations import (
-    ENDED,
     NO_STAGES,
-    RUNNING,
-    STALLED,
-    TAUT,
-    TOO_HARD,
     Asked,
     Point,
+    Status,
     TrialArrays,
     average_over,
     compiled,
@@ -53,7 +49,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     row = _write_at_rest(equations, trial, times, 0, 0.0, point, out)
     end_time = slack_time = np.nan
     if row == count:
-        return RUNNING, end_time, 0.0, 0, slack_time
+        return Status.RUNNING, end_time, 0.0, 0, slack_time
     last_time = times[count - 1]
     phase, slack_located = at_rest, False
     previous_stages, h, speed_scale = NO_STAGES, 0.0, 0.0
@@ -62,10 +58,10 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
         if phase == slack:
             slack_time = point.time if np.isnan(slack_time) else slack_time
             status, row, point, end_speed = _follow_slack(equations, trial, times, row, point, stop, rtol, out, work)
-            if status == ENDED:
+            if status == Status.ENDED:
                 _write_at_rest(equations, trial, times, row, np.inf, _at_position(point, stop), out)
-            if status != TAUT:
-                end_time = end_time if status == RUNNING else point.time
+            if status != Status.TAUT:
+                end_time = end_time if status == Status.RUNNING else point.time
                 return status, end_time, end_speed, n_steps, slack_time
             phase = at_rest if point.v <= 0 else moving
             time, x, v, _acceleration, chamber = point
@@ -79,7 +75,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 resting = Point(point.time, point.x, 0.0, 0.0, chamber)
                 row = _write_at_rest(equations, trial, times, row, start, resting, out)
                 if row == count:
-                    return STALLED, point.time, 0.0, n_steps, slack_time
+                    return Status.STALLED, point.time, 0.0, n_steps, slack_time
                 point = Point(start, point.x, 0.0, 0.0, chamber)
             if trial.inputs[FREE] > 0:
                 tension, _rate = _ask(equations, Asked.REST_TENSION, point.time, point.x, 0.0, point.chamber, trial)
@@ -102,7 +98,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
         )
         n_steps += 1
         if n_steps > MOST_STEPS:
-            return TOO_HARD, point.time, point.v, n_steps, slack_time
+            return Status.TOO_HARD, point.time, point.v, n_steps, slack_time
         factor = _judge_step(point, end, stages, converged, error, breakpoint_x, stop, speed_scale)
         if factor == 0:
             point = Point(
@@ -111,7 +107,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             phase, end_time = at_rest, point.time
             row = _write_at_rest(equations, trial, times, row, point.time, point, out)
             if row == count:
-                return STALLED, end_time, 0.0, n_steps, slack_time
+                return Status.STALLED, end_time, 0.0, n_steps, slack_time
             continue
         if factor < 1:
             h *= factor
@@ -132,9 +128,9 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             end_time = point.time + fraction * h
             _x, end_speed, _a = quintic(fraction, h, point, end)
             _write_at_rest(equations, trial, times, row, np.inf, _at_position(end, stop), out)
-            return ENDED, end_time, end_speed, n_steps, slack_time
+            return Status.ENDED, end_time, end_speed, n_steps, slack_time
         if row == count:
-            return RUNNING, end_time, end.v, n_steps, slack_time
+            return Status.RUNNING, end_time, end.v, n_steps, slack_time
         if phase == slack:
             x, v, a = quintic(fraction, h, point, end)
             chamber = point.chamber + fraction * (end.chamber - point.chamber)
@@ -161,14 +157,14 @@ def integrate_trials(equations, batch, first, last, rtol, out, ends, work, means
         status, end_time, end_speed, n_steps, slack_time = _integrate(
             equations, trial, times, batch.breakpoints[i], batch.stops[i], rtol, out[rows], work
         )
-        end = Point(end_time if status == ENDED else np.inf, batch.stops[i], end_speed, 0.0, 0.0)
+        end = Point(end_time if status == Status.ENDED else np.inf, batch.stops[i], end_speed, 0.0, 0.0)
         row_delay = equations.row_delay(trial)
         if row_delay != 0:
             read_by_rows(times, out[rows], trial.inputs[RATIO], end, row_delay)
         averaging_time_squared = equations.averaged_over(trial)
         if averaging_time_squared > 0:
             average_over(times, out[rows], means, trial.inputs[RATIO], end, averaging_time_squared)
-        ends[i, 0] = status
+        ends[i, 0] = status.value
         ends[i, 1] = end_time
         ends[i, 2] = end_speed
         ends[i, 3] = n_steps
@@ -357,24 +353,8 @@ def _resolvable_start(equations, trial, time, until, x, chamber, delay):
 # is taut again when the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests
 # there: its push on the tip is neglected, so that growth is too slow from then on.
 #
-# The method is that of Dormand & Prince with its continuous extension: E. Hairer, S. P. Nørsett and G. Wanner,
-# Solving Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation
-# (6.12).
-
-NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-WEIGHTS = (
-    (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0),
-    (44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)
-ERROR_WEIGHTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-DENSE_WEIGHTS = (
-    -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
-    701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
-)  # fmt: skip
+# The method is that of Bogacki & Shampine (Appl. Math. Lett. 2, 321, 1989), of order 3 with an error of order 2; within
+# a step the motion is the cubic through both ends and the rates there.
 
 
 class SlackState(NamedTuple):
@@ -458,54 +438,45 @@ def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
 
 
 @compiled
-def _stage_state(s, h, weights, k, n):
-    """The state s plus h times the weighted sum of the first n rows of k."""
-    x, v, y, chamber = s
-    for j in range(n):
-        x += h * weights[j] * k[j, 0]
-        v += h * weights[j] * k[j, 1]
-        y += h * weights[j] * k[j, 2]
-        chamber += h * weights[j] * k[j, 3]
-    return SlackState(x, v, y, chamber)
+def _moved_on(s, h, rates):
+    """The state s after h at constant rates, shape (4,)."""
+    return SlackState(s.x + h * rates[0], s.v + h * rates[1], s.y + h * rates[2], s.chamber + h * rates[3])
 
 
 @compiled
-def _dormand_prince(equations, trial, time, s, h, tip_speed, k):
-    """One step: k (7, 4), with its first row given, is completed. Returns the end, its error and the tip's speed."""
+def _slack_step(equations, trial, time, s, h, tip_speed, k):
+    """One step: k (5, 4), the rates at its start in the first row, is completed: those at its end are in the fourth.
+    Returns the end, its error and the tip's speed.
+    """
     moving = tip_speed > 0
-    end = s
-    u = tip_speed
-    for i in range(6):
-        end = _stage_state(s, h, WEIGHTS[i], k, i + 1)
-        u = _slack_rates(equations, trial, time + NODES[i] * h, end, u, moving, k[i + 1])
-    error_x, error_y = 0.0, 0.0
-    for i in range(7):
-        error_x += h * ERROR_WEIGHTS[i] * k[i, 0]
-        error_y += h * ERROR_WEIGHTS[i] * k[i, 2]
-    return end, max(abs(error_x), trial.inputs[RATIO] * abs(error_y)), u
+    u = _slack_rates(equations, trial, time + h / 2, _moved_on(s, h / 2, k[0]), tip_speed, moving, k[1])
+    u = _slack_rates(equations, trial, time + 3 / 4 * h, _moved_on(s, 3 / 4 * h, k[1]), u, moving, k[2])
+    for i in range(4):
+        k[4, i] = (2 * k[0, i] + 3 * k[1, i] + 4 * k[2, i]) / 9
+    end = _moved_on(s, h, k[4])
+    u = _slack_rates(equations, trial, time + h, end, u, moving, k[3])
+    for i in range(4):
+        k[4, i] = h * (k[1, i] / 12 + k[2, i] / 9 - 5 / 72 * k[0, i] - k[3, i] / 8)
+    return end, max(abs(k[4, 0]), trial.inputs[RATIO] * abs(k[4, 2])), u
 
 
 @compiled
 def _slack_at(part, h, s, end, k):
     """The state at the fraction `part` of a step."""
     return SlackState(
-        _dense(part, h, s.x, end.x, k[:, 0]),
-        _dense(part, h, s.v, end.v, k[:, 1]),
-        _dense(part, h, s.y, end.y, k[:, 2]),
-        _dense(part, h, s.chamber, end.chamber, k[:, 3]),
+        _cubic(part, s.x, end.x, h * k[0, 0], h * k[3, 0]),
+        _cubic(part, s.v, end.v, h * k[0, 1], h * k[3, 1]),
+        _cubic(part, s.y, end.y, h * k[0, 2], h * k[3, 2]),
+        _cubic(part, s.chamber, end.chamber, h * k[0, 3], h * k[3, 3]),
     )
 
 
 @compiled
-def _dense(part, h, start, end, rates):
-    """The continuous extension of one component, of order 4."""
+def _cubic(part, start, end, first, last):
+    """The cubic through both ends of a step, with these changes over a step at the rates there."""
     change = end - start
-    bend = h * rates[0] - change
-    last = 0.0
-    for i in range(7):
-        last += h * DENSE_WEIGHTS[i] * rates[i]
-    remainder = change - h * rates[6] - bend
-    return start + part * (change + (1 - part) * (bend + part * (remainder + (1 - part) * last)))
+    bend = first - change
+    return start + part * (change + (1 - part) * (bend + part * (change - last - bend)))
 
 
 @compiled
@@ -515,7 +486,7 @@ def _event_fraction(kind, stop, r, h, s, end, k):
     for _ in range(50):
         middle = 0.5 * (low + high)
         state = _slack_at(middle, h, s, end, k)
-        before = r * state.y < stop if kind == ENDED else state.x > r * state.y
+        before = r * state.y < stop if kind == Status.ENDED else state.x > r * state.y
         if before:
             low = middle
         else:
@@ -548,19 +519,19 @@ def _follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
     h = 1e-3 * (until - time)
     allowed = 1e-3 * rtol * stop
     for _ in range(MOST_STEPS):
-        end, error, u_end = _dormand_prince(equations, trial, time, s, h, u, k)
+        end, error, u_end = _slack_step(equations, trial, time, s, h, u, k)
         if not error <= allowed:
-            h *= max(0.2, 0.9 * (allowed / error) ** 0.2) if error < 1e300 else 0.1
+            h *= max(0.2, 0.9 * (allowed / error) ** (1 / 3)) if error < 1e300 else 0.1
             continue
-        status, fraction = RUNNING, 1.0
+        status, fraction = Status.RUNNING, 1.0
         if r * end.y >= stop:
-            status, fraction = ENDED, _event_fraction(ENDED, stop, r, h, s, end, k)
+            status, fraction = Status.ENDED, _event_fraction(Status.ENDED, stop, r, h, s, end, k)
         elif end.x <= r * end.y and end.v < u_end:
-            status, fraction = TAUT, _event_fraction(TAUT, stop, r, h, s, end, k)
+            status, fraction = Status.TAUT, _event_fraction(Status.TAUT, stop, r, h, s, end, k)
         row = _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, u_end, out)
         if row == times.size and time + fraction * h > until:
-            return RUNNING, row, Point(until, end.x, end.v, 0.0, end.chamber), u_end
-        if status != RUNNING:
+            return Status.RUNNING, row, Point(until, end.x, end.v, 0.0, end.chamber), u_end
+        if status != Status.RUNNING:
             state = _slack_at(fraction, h, s, end, k)
             return status, row, Point(time + fraction * h, r * state.y, max(state.v, 0.0), 0.0, state.chamber), u_end
         time += h
@@ -568,5 +539,5 @@ def _follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
         if s.x > tip:  # a payload that has reached the tip rests there
             s = SlackState(tip, min(s.v, u_end / r), s.y, s.chamber)
         u = _slack_rates(equations, trial, time, s, u_end, u_end > 0, k[0])
-        h *= min(5.0, 0.9 * (allowed / max(error, 1e-6 * allowed)) ** 0.2)
-    return TOO_HARD, row, Point(time, s.x, s.v, 0.0, s.chamber), u
+        h *= min(5.0, 0.9 * (allowed / max(error, 1e-6 * allowed)) ** (1 / 3))
+    return Status.TOO_HARD, row, Point(time, s.x, s.v, 0.0, s.chamber), u

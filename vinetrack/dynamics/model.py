@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.process import Printed
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.terminal import Printed
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, TrialInputs, catalogue, find_effect, load_effect
 from vinetrack.experiment.schema import COLUMNS

@@ -34,7 +34,7 @@ from vinetrack.core import units
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.tables import write_text
-from vinetrack.dynamics.equations import TOO_HARD, BatchArrays
+from vinetrack.dynamics.equations import BatchArrays, Status
 from vinetrack.dynamics.model import Model, check_needs, effects_on, hosted, shared_host
 from vinetrack.effects import Effect, State, TrialInputs
 
@@ -252,7 +252,7 @@ class Batch:
         longest = int(np.diff(self.starts).max(initial=0))
 
         def integrate(first: int, last: int) -> None:
-            work, means = np.empty((7, 4)), np.empty(longest)
+            work, means = np.empty((5, 4)), np.empty(longest)
             self.integrate_many(self.arrays, first, last, relative_tolerance, out, ends, work, means)
 
         if threads < 2:
@@ -467,19 +467,18 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
     """The trajectories of a batch that was run."""
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
-    statuses = ("running", "ended", "stalled", "too hard")  # in the order of the integrator's codes
     made = []
     for ratio, (first, last), end in zip(ratios, itertools.pairwise(edges), ends.tolist(), strict=True):
         (status, end_s, end_speed, n_steps, slack_from_s), time_s = end, batch.stamps[first:last]
         position, velocity, acceleration = motion[:, first:last]
-        how = statuses[int(status)], end_s, end_speed / ratio, int(n_steps), slack_from_s
+        how = Status(status).name.lower(), end_s, end_speed / ratio, int(n_steps), slack_from_s
         made.append(Trajectory(time_s, position, velocity, acceleration, out[first:last, 3], ratio, *how))
     return made
 
 
 def check_completed(ends: Floats, names: Sequence[str]) -> None:
     """Raise an error for a trial that the integrator could not complete. Shapes: ends (n_trials, 5)."""
-    failed = np.flatnonzero(ends[:, 0] == TOO_HARD)
+    failed = np.flatnonzero(ends[:, 0] == Status.TOO_HARD)
     if failed.size:
         end_s = float(ends[failed[0], 1])
         raise SimulationError(f"Trial {names[failed[0]]}: the model could not be integrated beyond {end_s:.6g} s.")

@@ -19,7 +19,7 @@ from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
 from vinetrack.kinematics.damping import student_95
 from vinetrack.narrative.diagnosis_text import METHOD_NAMES
-from vinetrack.paper import published
+from vinetrack.paper import motions as published
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -297,11 +297,11 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
             ax.plot(of_scale[x], of_scale[y], st.VINE_MARKERS[i], label=label, **style)
             span = np.geomspace(float(of_scale[x].min()) / 1.2, float(of_scale[x].max()) * 1.2, 50)
             printed = "printed B and n" if scale == max(published.DAMPING_B) else None
-            ax.plot(span, B * span**published.EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
+            ax.plot(span, B * span**published.PRINTED_EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
             if fitted and law.get("n"):
                 ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
         n = with_interval(law.get("n"), law.get("n_95_total"))
-        ax.set_title(f"{title}\nn = {n}, printed {published.EXPONENT:g}", fontsize=10.5)
+        ax.set_title(f"{title}\nn = {n}, printed {published.PRINTED_EXPONENT:g}", fontsize=10.5)
     axes[0].set_ylabel("growth force above yield (N)")
     for ax in axes:
         st.plain_log_ticks(ax)

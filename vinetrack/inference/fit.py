@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError

@@ -14,9 +14,9 @@ from pydantic import BeforeValidator, Field
 from scipy.special import ndtri_exp
 
 from vinetrack.core.problems import Remark
+from vinetrack.core.process import Drawn, Printed, table
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.terminal import Drawn, Printed, table
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.process import njit
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import njit
 from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, RELEASE
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.dynamics.equations import ENDED
+from vinetrack.dynamics.equations import Status
 from vinetrack.dynamics.model import Model, check_needs, with_pressures
 from vinetrack.dynamics.simulate import (
     Batch,
@@ -319,9 +319,9 @@ class Predictor:
         """Set the changes of position after the end of growth, see `position_change`."""
         plain, moved = motions.ends[trials], motions.ends[jobs]
         counts = np.diff(self.starts)[trials]
-        end_s = np.repeat(np.where(plain[:, 0] == ENDED, plain[:, 1], math.inf), counts)
+        end_s = np.repeat(np.where(plain[:, 0] == Status.ENDED, plain[:, 1], math.inf), counts)
         over = motions.batch.stamps[: self.starts[-1]][self._points_of(trials)] > end_s
-        at_end = np.where(moved[:, 0] == ENDED, change[np.cumsum(counts) - 1], 0.0)
+        at_end = np.where(moved[:, 0] == Status.ENDED, change[np.cumsum(counts) - 1], 0.0)
         change[over] = np.repeat(at_end, counts)[over]
 
     def products(self, columns: Sequence[Floats]) -> Floats:

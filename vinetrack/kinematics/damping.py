@@ -317,9 +317,7 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # Slopes are those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as
 # large if there is none.
 
-ISOMETRIC_WITHIN = 0.05  # Vines whose t/D agree within this fraction count as scaled copies of each other (chosen)
-SAME_WITHIN = 0.02  # Vines whose diameters agree within this fraction count as equal in diameter (chosen)
-SAME_SETTING_WITHIN = 0.01  # Pressures and payloads that agree within this fraction count as equal (chosen)
+SAME_WITHIN = 0.02  # Sizes, their ratios and settings that agree within this fraction count as equal (chosen)
 
 
 def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -335,22 +333,21 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         columns=["vine", "diameter_mm", "thickness_um", "B", "B_95_total"],
     )
     table["wall_over_diameter"] = table["thickness_um"] / table["diameter_mm"]
-    isometric = _families(table, "diameter_mm", {"wall_over_diameter": ISOMETRIC_WITHIN})
-    thickness = _families(table, "thickness_um", {"diameter_mm": SAME_WITHIN})
+    isometric = _families(table, "diameter_mm", "wall_over_diameter")
+    thickness = _families(table, "thickness_um", "diameter_mm")
     reason = None
     if not isometric and not thickness:
         reason = f"of the vines with a B, {len(vines)}, no two are scaled copies of each other or of equal diameter"
     return {"method": "both_axes", "isometric": isometric, "thickness": thickness, "reason": reason}
 
 
-def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> list[dict[str, Any]]:
+def _families(table: pd.DataFrame, along: str, other: str) -> list[dict[str, Any]]:
     """Groups of vines of several sizes that are alike in another, with the dependence of B on the size."""
-    (other,) = within
     ordered = table.dropna(subset=[along, other]).sort_values(other, kind="stable")
     return [
         {"along": along, "sizes": group[along].tolist(), **_values(group, (), ("vine", "B", "B_95_total"))}
         | _lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group))
-        for group in _of_several_sizes(ordered, within, [along])
+        for group in _of_several_sizes(ordered, [other], [along])
     ]
 
 
@@ -399,16 +396,15 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
     return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
 
 
-def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
-    """Group rows that agree in all given columns within a fraction of the group's first row."""
+def alike(table: pd.DataFrame, columns: Iterable[str]) -> list[pd.DataFrame]:
+    """Group rows that agree in all these columns with the group's first row."""
     groups: list[pd.DataFrame] = []
     left = table
     while len(left):
         first = left.iloc[0]
         same = np.ones(len(left), dtype=bool)
-        for column, fraction in within.items():
-            values = left[column].to_numpy(float)
-            same &= np.abs(values - first[column]) <= fraction * abs(float(first[column])) + 1e-12
+        for column in columns:
+            same &= np.isclose(left[column].to_numpy(float), float(first[column]), rtol=SAME_WITHIN, atol=1e-12)
         groups.append(left[same])
         left = left[~same]
     return groups
@@ -418,11 +414,7 @@ def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
     bare = conditions[(conditions["payload_g"] == 0) & (conditions["x_ss_m_s"] > 0)]
     bare = bare.assign(wall_over_diameter=1e-3 * bare["thickness_um"] / bare["diameter_mm"])
     bare = bare[np.isfinite(bare["wall_over_diameter"])]
-    settings = {
-        "wall_over_diameter": ISOMETRIC_WITHIN,
-        "pressure_kPa": SAME_SETTING_WITHIN,
-        "growth_angle_deg": SAME_SETTING_WITHIN,
-    }
+    settings = ["wall_over_diameter", "pressure_kPa", "growth_angle_deg"]
     speeds = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
     families = []
     for group in _of_several_sizes(bare, settings, ["diameter_mm"]):
@@ -440,21 +432,15 @@ def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
     return families
 
 
-def _of_several_sizes(table: pd.DataFrame, within: Mapping[str, float], sizes: list[str]) -> list[pd.DataFrame]:
+def _of_several_sizes(table: pd.DataFrame, same: list[str], sizes: list[str]) -> list[pd.DataFrame]:
     """Groups of rows that are alike but for their sizes, in the order of size; the largest group first."""
-    groups = [group.sort_values(sizes) for group in alike(table, within)]
+    groups = [group.sort_values(sizes) for group in alike(table, same)]
     return sorted((group for group in groups if len(group[sizes].drop_duplicates()) > 1), key=lambda group: -len(group))
 
 
 def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
     known = conditions[(conditions["efficiency"] > 0) & np.isfinite(conditions["thickness_um"])]
-    settings = {
-        "pressure_kPa": SAME_SETTING_WITHIN,
-        "payload_g": SAME_SETTING_WITHIN,
-        "length_mm": SAME_WITHIN,
-        "efficiency_at_mm": 0.0,
-        "growth_angle_deg": SAME_SETTING_WITHIN,
-    }
+    settings = ["pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm", "growth_angle_deg"]
     efficiencies = ("efficiency", "efficiency_payload", "efficiency_with_weight")
     shared = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
     each = ("condition", "vine", "diameter_mm", "thickness_um", "n_efficiency", "weight_share")

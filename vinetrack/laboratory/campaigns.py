@@ -35,7 +35,7 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.inference.fit_result import DAMPING, EXPONENT
 from vinetrack.laboratory.render import FrameRenderer, Motion, Truth, paint_board
 from vinetrack.laboratory.scene import PATTERN_PX, Camera, Scene, Target, Tube, preset
-from vinetrack.paper import published
+from vinetrack.paper import motions
 from vinetrack.tracks.position_noise import ar1_noise
 from vinetrack.video.track import track_recording
 
@@ -168,7 +168,7 @@ class Vine:
     yield_pressure_kPa: float = 3.0
 
     def trial(
-        self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = published.CAPTURE_FPS
+        self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = motions.CAPTURE_FPS
     ) -> Trial:
         """Make one trial with this vine."""
         return Trial(
@@ -197,8 +197,8 @@ def campaign(
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
     """Parameters of isometric vines as `GroundTruth.values` takes them: the printed B by vine, N·(s/m)ⁿ, and n."""
-    by_vine = {trial.vine: published.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
-    return {DAMPING: by_vine, EXPONENT: published.EXPONENT}
+    by_vine = {trial.vine: motions.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
+    return {DAMPING: by_vine, EXPONENT: motions.PRINTED_EXPONENT}
 
 
 # ------------------------------------------------------------------------------

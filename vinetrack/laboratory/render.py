@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from vinetrack.core.process import njit
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import njit
 from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
 
 Image = NDArray[np.float32]

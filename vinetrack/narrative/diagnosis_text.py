@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core import units
 from vinetrack.core.problems import joined
-from vinetrack.core.terminal import table
+from vinetrack.core.process import table
 from vinetrack.core.units import decimals, display_unit, number, pressure_text, with_error, with_interval
 from vinetrack.diagnosis.ladder import not_better
 from vinetrack.diagnosis.result import EXPECTED, NOT_TESTABLE, Diagnosis, Round

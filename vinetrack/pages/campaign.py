@@ -16,8 +16,8 @@ import pandas as pd
 
 import vinetrack.results as layout
 from vinetrack.core.problems import UserError, reasons_told
+from vinetrack.core.process import THREAD_PREFIX, in_one_blas_thread
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.core.threads import THREAD_PREFIX, in_one_blas_thread
 from vinetrack.diagnosis.ladder import rms_of
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue

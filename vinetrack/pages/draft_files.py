@@ -23,9 +23,8 @@ from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, SHEET, corre
 from vinetrack.experiment.schema import COLUMNS, SHARED, did_you_mean, value_and_unit
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.pipeline.workflow import SHARED_FILES
-from vinetrack.tracks.importers import read_track
+from vinetrack.tracks.importers import FEWEST_POINTS, read_track
 from vinetrack.video.survey import entries, is_calibration, list_recordings, natural_order
-from vinetrack.video.track import FEWEST_FRAMES
 
 # ------------------------------------------------------------------------------
 # A quantity has one column in a table, in whichever unit.
@@ -442,7 +441,7 @@ _UNITS = {unit.lower(): name for name, (_, units) in _IN_NAMES.items() for unit 
 def list_pictures(folder: Path) -> list[str]:
     """Return single pictures and films that may show a ruler or a board, as paths relative to the folder."""
     pictures = [path for path in entries(folder) if path.is_file() and path.suffix.lower() in IMAGES]
-    pictures = pictures if len(pictures) < FEWEST_FRAMES else []
+    pictures = pictures if len(pictures) < FEWEST_POINTS else []
     for sub in entries(folder):
         if sub.is_dir() and is_calibration(sub):
             pictures += [path for path in entries(sub) if path.suffix.lower() in IMAGES | CONTAINERS]

@@ -19,7 +19,7 @@ from markupsafe import Markup
 from tornado.ioloop import IOLoop
 
 from vinetrack.core.problems import ExperimentError, InputError, format_problems
-from vinetrack.core.terminal import waiting
+from vinetrack.core.process import waiting
 from vinetrack.core.units import DISPLAY_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE, Diagnosis
 from vinetrack.effects import BASE_EFFECTS

@@ -23,9 +23,9 @@ from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from vinetrack.core.problems import ExperimentError, InputError, Problem, UserError
+from vinetrack.core.process import THREAD_PREFIX
 from vinetrack.core.records import Correction
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join
-from vinetrack.core.threads import THREAD_PREFIX
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import (
     CORRECTIONS_FILE,
@@ -46,10 +46,9 @@ from vinetrack.pages.local_page import TEMPLATES, TOKENS_CSS, PageServer, jpeg, 
 from vinetrack.pipeline.workflow import check_folder, identity
 from vinetrack.report.build import TOKENS, base64_uri
 from vinetrack.tracks.importers import attach_pressure, read_pressure_trace
-from vinetrack.video.axis import Axis, axis_entry, axis_through, find_growth_axis
+from vinetrack.video.axis import Axis, SmallPictures, axis_entry, axis_through, find_growth_axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
-from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.survey import Keep, measure_recording, size_problems, tracked_facts
 from vinetrack.video.track import Tracking
 

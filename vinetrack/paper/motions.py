@@ -24,9 +24,40 @@ from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.kinematics.damping import fit_laws
 from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
-from vinetrack.paper import published
 from vinetrack.planning.prediction import gauge_left
-from vinetrack.planning.predictive_inputs import damping_prior
+from vinetrack.planning.predictive_inputs import (
+    DAMPING_B,
+    DIAMETER_MM,
+    PRINTED_EXPONENT,
+    THICKNESS_UM,
+    YIELD_PRESSURE_KPA,
+    damping_prior,
+)
+
+# ------------------------------------------------------------------------------
+# Published numbers, beside those of Table I and the damping law; those with one use stand where they are used.
+
+CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)
+CHAMBER_L = 3.7  # Volume of the chamber, litres (published)
+LONGEST_VINE_MM = 280.0  # Length of the largest vine, 24 mm in diameter (published)
+CHAMBER_CHANGE, CHAMBER_ALLOWED = 0.035, 0.05  # Relative change of its volume by the largest vine (published)
+PAYLOAD_G = 35.6  # Payload of Figs. 4 and 9 (published)
+# RMS position error of the model by pressure in kPa, for the 24 mm × 200 µm vine with payload (Fig. 4, Table II)
+POSITION_RMS_CM = {7: 1.90, 14: 0.29, 28: 0.31}
+# RMS error of the final speed by pressure in kPa, for 24 mm × 150 µm vines with several payloads (Fig. 5, Table II)
+FINAL_SPEED_RMS_M_S = {14: 0.27, 28: 0.56, 41: 1.35}
+FINAL_SPEED_AT_MM = 120.0  # Travel at which the final speed of Fig. 5 is evaluated (published)
+FINAL_SPEED_THICKNESS_UM = 150.0  # Wall of the vines of Fig. 5 (published)
+STEADY_SPEED_KPA, STEADY_SPEED_R2 = 24.0, 0.935  # Steady speed against scale (published)
+EFFICIENCY_KPA = 34.0  # Pressure of the energy efficiency with payload, Fig. 9 (published)
+# The fastest vine, without payload, at a pressure just below its burst pressure
+FAST_VINE = {"thickness_um": 100.0, "diameter_mm": 25.0, "length_mm": 400.0, "pressure_kPa": 62.0}
+
+
+def scale_of(diameter_mm: float, thickness_um: float) -> int | None:
+    """Return the scale R of the vine of Table I with this size, to within 1 %; None for any other."""
+    off = {R: (abs(diameter_mm / DIAMETER_MM[R] - 1), abs(thickness_um / THICKNESS_UM[R] - 1)) for R in DIAMETER_MM}
+    return next((scale for scale, parts in off.items() if all(part < 0.01 for part in parts)), None)
 
 
 def area_m2(diameter_mm: float) -> float:
@@ -55,7 +86,7 @@ class Departure:
         model = base_model()
         if self.gamma is not None:
             model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
-        return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
+        return model.with_values({"eversion_damping.B": B, "eversion_damping.n": PRINTED_EXPONENT})
 
 
 NONE = Departure("eq2")
@@ -74,34 +105,34 @@ def paper_trial(
     """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa."""
     return Trial(
         name=f"{diameter_mm:g} mm × {thickness_um:g} µm at {pressure_kPa:g} kPa",
-        capture_fps=published.CAPTURE_FPS,
+        capture_fps=CAPTURE_FPS,
         diameter_m=diameter_mm / 1e3,
         thickness_m=thickness_um / 1e6,
         length_m=length_mm / 1e3,
         pressure_Pa=1e3 * pressure_kPa,
-        yield_pressure_Pa=1e3 * published.YIELD_PRESSURE_KPA,
+        yield_pressure_Pa=1e3 * YIELD_PRESSURE_KPA,
         payload_kg=payload_g / 1e3,
-        chamber_m3=published.CHAMBER_L / 1e3,
+        chamber_m3=CHAMBER_L / 1e3,
     )
 
 
 def position_trials() -> list[Trial]:
     """Return the trials of the paper's Fig. 4: the 24 mm × 200 µm vine, as long as the longest, with its payload."""
-    size = (published.DIAMETER_MM[4], published.THICKNESS_UM[4], published.LONGEST_VINE_MM)
-    return [paper_trial(*size, pressure_kPa, published.PAYLOAD_G) for pressure_kPa in published.POSITION_RMS_CM]
+    size = (DIAMETER_MM[4], THICKNESS_UM[4], LONGEST_VINE_MM)
+    return [paper_trial(*size, pressure_kPa, PAYLOAD_G) for pressure_kPa in POSITION_RMS_CM]
 
 
 def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
     """Compute the differences of each departure from Eq. (2)."""
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
-        plain = follow(trial, NONE, published.DAMPING_B[4])
+        plain = follow(trial, NONE, DAMPING_B[4])
         for departure in DEPARTURES:
-            moved = follow(trial, departure, published.DAMPING_B[4])
+            moved = follow(trial, departure, DAMPING_B[4])
             rms_m = position_rms_m(plain, moved, trial)
             rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
-    for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
-        size = (published.DIAMETER_MM[4], published.FINAL_SPEED_THICKNESS_UM, published.LONGEST_VINE_MM)
+    for pressure_kPa in FINAL_SPEED_RMS_M_S:
+        size = (DIAMETER_MM[4], FINAL_SPEED_THICKNESS_UM, LONGEST_VINE_MM)
         trials = [paper_trial(*size, pressure_kPa, payload_g) for payload_g in payloads_g]
         plain_m_s = [final_speed_m_s(trial) for trial in trials]
         for departure in DEPARTURES:
@@ -114,7 +145,7 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
     """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
-    time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
+    time_s = np.arange(0, LASTS_S, 1 / CAPTURE_FPS)
     return simulate(departure.model(B), replace(trial, tail_slack="free" if departure.slack else "taut"), time_s)
 
 
@@ -129,7 +160,7 @@ def motion_table() -> pd.DataFrame:
     parts = []
     for trial in position_trials():
         for departure in (NONE, *DEPARTURES):
-            moved = follow(trial, departure, published.DAMPING_B[4])
+            moved = follow(trial, departure, DAMPING_B[4])
             end_s = moved.end_time_s if math.isfinite(moved.end_time_s) else LASTS_S
             time_s = np.linspace(0, end_s, 200)
             motion = {"time_s": time_s, "lead_position_m": np.interp(time_s, moved.time_s, moved.lead_position_m)}
@@ -177,13 +208,13 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
     """Apply the published rule to noise-free motions with the printed B and n; return the n and B it finds."""
     departure = Departure("", gamma=gamma)
     # 10.0: duration of the simulated motions, s (chosen)
-    time_s = np.arange(0, 10.0, 1 / published.CAPTURE_FPS)
+    time_s = np.arange(0, 10.0, 1 / CAPTURE_FPS)
     rows = []
-    for scale, B in published.DAMPING_B.items():
+    for scale, B in DAMPING_B.items():
         of_scale = [
-            replace(trial, chamber_m3=published.CHAMBER_L / 1e3, yield_pressure_Pa=1e3 * published.YIELD_PRESSURE_KPA)
+            replace(trial, chamber_m3=CHAMBER_L / 1e3, yield_pressure_Pa=1e3 * YIELD_PRESSURE_KPA)
             for trial in trials
-            if published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m) == scale
+            if scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m) == scale
         ]
         runs = simulate_many(departure.model(B), of_scale, [time_s] * len(of_scale))
         rows += [_point(scale, trial, moved) for trial, moved in zip(of_scale, runs, strict=True)]
@@ -255,8 +286,8 @@ def since_release(kinematics: pd.DataFrame, estimates: TrialEstimates) -> pd.Dat
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
     """Trials of Fig. 4, the 24 mm × 200 µm vine with the paper's payload, by pressure in kPa; one condition each."""
     conditions: dict[float, list[Trial]] = {}
-    for pressure_kPa in published.POSITION_RMS_CM:
-        alike = [trial for trial in trials if _is(trial, published.THICKNESS_UM[4], pressure_kPa, published.PAYLOAD_G)]
+    for pressure_kPa in POSITION_RMS_CM:
+        alike = [trial for trial in trials if _is(trial, THICKNESS_UM[4], pressure_kPa, PAYLOAD_G)]
         if alike:
             conditions[float(pressure_kPa)] = [trial for trial in alike if trial.condition == alike[0].condition]
     return conditions
@@ -265,16 +296,16 @@ def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
 def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
     """Trials of Fig. 5, 24 mm × 150 µm vines at the paper's pressures with any payload, by condition."""
     conditions: dict[str, list[Trial]] = {}
-    for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
+    for pressure_kPa in FINAL_SPEED_RMS_M_S:
         for trial in trials:
-            if _is(trial, published.FINAL_SPEED_THICKNESS_UM, pressure_kPa) and trial.payload_kg > 0:
+            if _is(trial, FINAL_SPEED_THICKNESS_UM, pressure_kPa) and trial.payload_kg > 0:
                 conditions.setdefault(trial.condition, []).append(trial)
     return conditions
 
 
 def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float | None = None) -> bool:
     ours = (1e3 * trial.diameter_m, 1e6 * trial.thickness_m, trial.pressure_Pa / 1e3, 1e3 * trial.payload_kg)
-    printed = (published.DIAMETER_MM[4], thickness_um, pressure_kPa, payload_g)
+    printed = (DIAMETER_MM[4], thickness_um, pressure_kPa, payload_g)
     return all(two is None or math.isclose(one, two, rel_tol=0.02) for one, two in zip(ours, printed, strict=True))
 
 
@@ -291,7 +322,7 @@ def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame])
     if not motions:
         return np.empty(0), np.empty((0, 0))
     end_s = min(float(time_s[-1]) for time_s, _ in motions)
-    common_s = np.arange(0, end_s, 1 / published.CAPTURE_FPS)
+    common_s = np.arange(0, end_s, 1 / CAPTURE_FPS)
     return common_s, np.array([np.interp(common_s, *motion) for motion in motions])
 
 
@@ -311,7 +342,7 @@ def position_tables(
         sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
         columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
         parts.append(pd.DataFrame(dict(zip(names, columns, strict=True))))
-        plain = follow(trials[0], NONE, published.DAMPING_B[4])
+        plain = follow(trials[0], NONE, DAMPING_B[4])
         stop = int(np.searchsorted(plain.lead_position_m, END_FRACTION * trials[0].length_m))
         counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
         off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
@@ -324,7 +355,7 @@ def position_tables(
 def final_speeds(conditions: Mapping[str, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Average the lead speed at the paper's 12 cm, and compute it by Eq. (2); columns `SPEED_COLUMNS`."""
     rows = []
-    at_m = published.FINAL_SPEED_AT_MM / 1e3
+    at_m = FINAL_SPEED_AT_MM / 1e3
     for condition, trials in conditions.items():
         moved = [grown[trial.name] for trial in trials if trial.name in grown]
         speeds = [
@@ -343,9 +374,9 @@ def final_speed_m_s(trial: Trial, departure: Departure = NONE) -> float:
     """Return the speed of the leading edge at the paper's 12 cm by Eq. (2), or with a departure from it; 0 where it
     does not get there. B of Fig. 5's vine is not printed and taken as proportional to the wall.
     """
-    B = published.DAMPING_B[4] * 1e6 * trial.thickness_m / published.THICKNESS_UM[4]
+    B = DAMPING_B[4] * 1e6 * trial.thickness_m / THICKNESS_UM[4]
     moved = follow(trial, departure, B)
-    speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, published.FINAL_SPEED_AT_MM / 1e3)
+    speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, FINAL_SPEED_AT_MM / 1e3)
     return speed if math.isfinite(speed) else 0.0
 
 

@@ -22,10 +22,9 @@ from vinetrack.core.records import Trial
 from vinetrack.core.units import GRAVITY_M_S2, convert, or_nan
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.damping import regress
-from vinetrack.paper import motions, published
-from vinetrack.paper.published import SOURCE
+from vinetrack.paper import motions
 from vinetrack.planning.prediction import GAMMAS, gauge_left
-from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
+from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, DAMPING_R2, SOURCE, damping_prior, hoop_stress_Pa
 
 SIMULATED = "simulated from printed parameters"
 MEASURED = "measured"
@@ -63,7 +62,7 @@ def row_of(
     `published_as` is NaN where the paper prints no number; `mark` tells whether the trials were simulated or filmed.
     """
     text = _texts()[name]
-    facts |= {"paper": published, "published": published_as}
+    facts |= {"paper": motions, "published": published_as}
     kind, how = text["mark"], text["how"]
     if kind.startswith("trials"):
         kind = NOT_CHECKABLE if kind == "trials if measured" and mark == SIMULATED else mark
@@ -96,14 +95,14 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
     """Compare the protocol of an experiment with that of the paper."""
     bare = [trial for trial in trials if trial.payload_kg == 0 and trial.travel_ratio == 2]
     by_scale = {
-        R: [t for t in bare if published.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == R]
-        for R in published.DAMPING_B
+        R: [t for t in bare if motions.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == R]
+        for R in motions.DAMPING_B
     }
     for R, vines in by_scale.items():
         thickness_um = _mean([1e6 * trial.thickness_m for trial in vines])
         diameter_mm = _mean([1e3 * trial.diameter_m for trial in vines])
-        yield row_of("thickness_R{R}", thickness_um, published_as=published.THICKNESS_UM[R], mark=mark, R=R)
-        yield row_of("diameter_R{R}", diameter_mm, published_as=published.DIAMETER_MM[R], mark=mark, R=R)
+        yield row_of("thickness_R{R}", thickness_um, published_as=motions.THICKNESS_UM[R], mark=mark, R=R)
+        yield row_of("diameter_R{R}", diameter_mm, published_as=motions.DIAMETER_MM[R], mark=mark, R=R)
         yield row_of("press_R{R}", published_as={1: 110.0, 2: 82.0, 3: 96.0, 4: 96.0}[R], R=R)  # °C, as printed
         yield row_of("laser_R{R}", published_as={1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}[R], R=R)  # %, as printed
     for R, vines in by_scale.items():
@@ -111,7 +110,7 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
         yield row_of("pressures_R{R}", float(len(replicates)) if vines else nan, mark=mark, R=R)
         yield row_of("trials_R{R}", float(replicates.median()), mark=mark, R=R)
     rates = [trial.capture_fps for trial in trials if math.isfinite(trial.capture_fps)]
-    yield row_of("capture_fps", _median(rates), published_as=published.CAPTURE_FPS, mark=mark)
+    yield row_of("capture_fps", _median(rates), published_as=motions.CAPTURE_FPS, mark=mark)
     names = {trial.name for vines in by_scale.values() for trial in vines}
     # What the published rule for a steady window accepts in trials without payload, and the gated rule
     windows = steady[steady["trial"].isin(names)]
@@ -179,26 +178,26 @@ def _law_rows(mark: str, damping: Mapping[str, Any]) -> Iterator[Row]:
     laws = {method: damping.get(method) or {} for method in ("log_log", "both_axes", "paper")}
     for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
         interval = _bounds(law.get("n_95_total"))
-        yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=mark)
-    for R, printed in published.DAMPING_B.items():
+        yield row_of(row, or_nan(law.get("n")), interval, published_as=motions.PRINTED_EXPONENT, mark=mark)
+    for R, printed in motions.DAMPING_B.items():
         log_log, ours, literal = (_vine_of(law, R) for law in laws.values())
         B, interval, n = or_nan(ours.get("B")), _bounds(ours.get("B_95_total")), ours.get("n_trials", 0)
         by_rule: Row = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
         yield row_of("B_R{R}", B, interval, published_as=printed, mark=mark, R=R, n=n, **by_rule)
         R2 = or_nan(log_log.get("R2"))
-        yield row_of("R2_R{R}", R2, published_as=published.DAMPING_R2[R], mark=mark, R=R)
+        yield row_of("R2_R{R}", R2, published_as=DAMPING_R2[R], mark=mark, R=R)
 
 
 def _vine_of(law: Mapping[str, Any], R: int) -> Mapping[str, Any]:
     """What a law says of the vine of scale R."""
     vines: Iterable[Mapping[str, Any]] = (law.get("vines") or {}).values()
-    return next((vine for vine in vines if published.scale_of(vine["diameter_mm"], vine["thickness_um"]) == R), {})
+    return next((vine for vine in vines if motions.scale_of(vine["diameter_mm"], vine["thickness_um"]) == R), {})
 
 
 def _motion_rows(
     mark: str, fit: FitSummary, positions: pd.DataFrame, speeds: pd.DataFrame, departures: pd.DataFrame
 ) -> Iterator[Row]:
-    for kPa, printed in published.POSITION_RMS_CM.items():
+    for kPa, printed in motions.POSITION_RMS_CM.items():
         lines = _at_pressure(positions, kPa)
         first: Any = lines.iloc[0] if len(lines) else {"n_trials": 0, "rms_mean_m": nan}
         facts: Row = {
@@ -214,8 +213,8 @@ def _motion_rows(
         if fitted.key == "yield_pressure.P_y" and fitted.vine.startswith("24mm-200um")
     ]
     yield_kPa, *interval = pressures[-1] if pressures else (nan, nan, nan)
-    yield row_of("yield_pressure", yield_kPa, interval, published_as=published.YIELD_PRESSURE_KPA, mark=mark)
-    for kPa, printed in published.FINAL_SPEED_RMS_M_S.items():
+    yield row_of("yield_pressure", yield_kPa, interval, published_as=motions.YIELD_PRESSURE_KPA, mark=mark)
+    for kPa, printed in motions.FINAL_SPEED_RMS_M_S.items():
         lines = _at_pressure(speeds, kPa)
         off = (lines["final_lead_velocity_m_s"] - lines["eq2_lead_velocity_m_s"]).to_numpy(float)
         facts = {
@@ -255,14 +254,14 @@ def _scale_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
     yield row_of("our_B_line_R2", or_nan((isometric.get("line") or {}).get("R2")), mark=mark)
 
     families: Sequence[Mapping[str, Any]] = scaling.get("steady_speed") or ()
-    family = next((one for one in families if _close(one["pressure_kPa"], published.STEADY_SPEED_KPA)), {})
+    family = next((one for one in families if _close(one["pressure_kPa"], motions.STEADY_SPEED_KPA)), {})
     n, line = len(family.get("sizes", ())), family.get("line") or {}
     counts = [int(count) for count in family.get("n_steady", ())]
     # 4: the printed N of Figs. 4, 5, 8 and 9
     yield row_of("steady_speed_trials", _median(counts), published_as=4.0, mark=mark, n=n)
     facts: Row = {"p": line["p"], "monotonic": "yes" if family.get("monotonic") else "no"} if line else {}
     R2 = or_nan(line.get("R2"))
-    yield row_of("steady_speed_R2", R2, published_as=published.STEADY_SPEED_R2, mark=mark, n=n, **facts)
+    yield row_of("steady_speed_R2", R2, published_as=motions.STEADY_SPEED_R2, mark=mark, n=n, **facts)
     yield row_of("steady_speed_power", **_fitted(family.get("power") or {}), mark=mark, n=n)
     relative = (family.get("over_diameter") or {}).get("power") or {}
     yield row_of("steady_speed_over_diameter_power", **_fitted(relative), mark=mark, n=n)
@@ -288,7 +287,7 @@ def _efficiency_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
     families = [
         family
         for family in scaling.get("efficiency") or ()
-        if _close(family["pressure_kPa"], published.EFFICIENCY_KPA) and _close(family["payload_g"], published.PAYLOAD_G)
+        if _close(family["pressure_kPa"], motions.EFFICIENCY_KPA) and _close(family["payload_g"], motions.PAYLOAD_G)
     ]
     trends: Mapping[str, Any] = families[0]["trend"] if families else {}
     names = {
@@ -306,7 +305,7 @@ def _efficiency_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
 def _fast_row(mark: str, table: pd.DataFrame) -> Row:
     same = np.array(table["payload_g"] == 0)
     for column in ("diameter_mm", "thickness_um", "pressure_kPa"):
-        same &= np.isclose(table[column].to_numpy(float), published.FAST_VINE[column], rtol=0.02)
+        same &= np.isclose(table[column].to_numpy(float), motions.FAST_VINE[column], rtol=0.02)
     speed, place = nan, ""
     if same.any():
         first = table[same].iloc[0]
@@ -328,36 +327,36 @@ def p_value(R2: float, n: int) -> float:
 
 def weight_over_gas(diameter_mm: float) -> float:
     """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
-    gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * motions.area_m2(diameter_mm)
-    return published.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
+    gas_Pa_m2 = 1e3 * motions.EFFICIENCY_KPA * motions.area_m2(diameter_mm)
+    return motions.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
 
 
 def computed_rows() -> Iterator[Row]:
     """Yield every row of the table that needs no experiment and no simulation."""
-    walls_um, diameters_mm = published.THICKNESS_UM, published.DIAMETER_MM
-    for R in published.DAMPING_B:
+    walls_um, diameters_mm = motions.THICKNESS_UM, motions.DIAMETER_MM
+    for R in motions.DAMPING_B:
         relative = walls_um[R] / diameters_mm[R] / (walls_um[1] / diameters_mm[1])
         yield row_of("isometry_R{R}", relative, published_as=1.0, R=R)
-    change = motions.volume_change(published.CHAMBER_L / 1e3, max(diameters_mm.values()), published.LONGEST_VINE_MM)
-    printed_change, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
+    change = motions.volume_change(motions.CHAMBER_L / 1e3, max(diameters_mm.values()), motions.LONGEST_VINE_MM)
+    printed_change, allowed = 100 * motions.CHAMBER_CHANGE, 100 * motions.CHAMBER_ALLOWED
     yield row_of("chamber_volume_change", 100 * change, published_as=printed_change)
-    for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
+    for kPa in sorted(motions.POSITION_RMS_CM, reverse=True):
         for law, gamma in GAMMAS.items():
             drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
             facts: Row = {"kPa": kPa, "speed": law.split(",")[0], "process": law.split()[1]}
             yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed_change, allowed=allowed, **facts)
-    R2, n = published.STEADY_SPEED_R2, len(published.DAMPING_B)
+    R2, n = motions.STEADY_SPEED_R2, len(motions.DAMPING_B)
     yield row_of("steady_speed_p_value", p_value(R2, n), published_as=0.32, n=n)  # 0.32: as printed
-    scales, B = (np.array(list(values), dtype=float) for values in (published.DAMPING_B, published.DAMPING_B.values()))
+    scales, B = (np.array(list(values), dtype=float) for values in (motions.DAMPING_B, motions.DAMPING_B.values()))
     power, line = regress(np.log(scales), np.log(B)), regress(scales, B)
     yield row_of("B_power_of_scale", power["slope"], power["slope_95"])
     yield row_of("B_line_R2", line["R2"])
     yield row_of("B_line_intercept", line["intercept"], line["intercept_95"])
-    gauge_Pa, yield_Pa = 1e3 * published.STEADY_SPEED_KPA, 1e3 * published.YIELD_PRESSURE_KPA
-    for R, printed in published.DAMPING_B.items():
+    gauge_Pa, yield_Pa = 1e3 * motions.STEADY_SPEED_KPA, 1e3 * motions.YIELD_PRESSURE_KPA
+    for R, printed in motions.DAMPING_B.items():
         # By Eq. (3)
         forces_N = [(gauge_Pa - least_Pa) * motions.area_m2(diameters_mm[R]) for least_Pa in (0.0, yield_Pa)]
-        bare, with_yield = ((force_N / printed) ** (1 / published.EXPONENT) for force_N in forces_N)
+        bare, with_yield = ((force_N / printed) ** (1 / motions.PRINTED_EXPONENT) for force_N in forces_N)
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
@@ -367,10 +366,10 @@ def computed_rows() -> Iterator[Row]:
     slow, fast = (100 * (1 - gauge_left(1e3 * 48.0, change, gamma)) for gamma in GAMMAS.values())
     yield row_of("injector_volume_change", 100 * change, published_as=injected)
     yield row_of("injector_gauge_drop", slow, published_as=injected, fast=fast)
-    for R, printed in published.DAMPING_B.items():
+    for R, printed in motions.DAMPING_B.items():
         guess = damping_prior(diameters_mm[R] / 1e3, walls_um[R] / 1e6)
         yield row_of("guessed_B_R{R}", guess, published_as=printed, R=R)
-    vine = published.FAST_VINE
+    vine = motions.FAST_VINE
     stress_Pa = hoop_stress_Pa(1e3 * vine["pressure_kPa"], vine["diameter_mm"] / 1e3, vine["thickness_um"] / 1e6)
     yield row_of("fast_vine_hoop_stress", stress_Pa / 1e6, burst_MPa=BURST_STRESS_PA / 1e6)
     # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
@@ -389,7 +388,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     """Compute the rows on the fast vine, on air drag, and on the published rule for noise-free motions."""
     # Fractions of the length at which the speed of the fast vine is evaluated (chosen)
     fast_at = (0.90, 0.95, 0.98, 0.99)
-    fast = published.FAST_VINE
+    fast = motions.FAST_VINE
     B = damping_prior(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
     for fraction, speed in zip(fast_at, motions.speeds_at(fast_at, fast), strict=True):
         # 56: the speed of its leading edge, m/s, that the authors predict
@@ -402,14 +401,14 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     # Bias of the published rule in noise-free motions, with a full and with a depleting chamber
     chosen: dict[str, Trial] = {}
     for trial in trials:
-        scale = published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
+        scale = motions.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
         if scale is not None and trial.payload_kg == 0 and trial.travel_ratio == 2:
             chosen.setdefault(trial.condition, trial)
-    if len(chosen) < len(published.DAMPING_B):
+    if len(chosen) < len(motions.DAMPING_B):
         return
     cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
     for row, gamma in cases.items():
         n, found = motions.rule_on_noise_free(gamma, list(chosen.values()))
         scales = sorted(found)
         facts = {"B": ", ".join(f"{found[R]:.2f}" for R in scales), "scales": ", ".join(map(str, scales))}
-        yield row_of(row, n, published_as=published.EXPONENT, n=len(chosen), **facts)
+        yield row_of(row, n, published_as=motions.PRINTED_EXPONENT, n=len(chosen), **facts)

@@ -15,10 +15,9 @@ import numpy as np
 
 import vinetrack.results as layout
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
+from vinetrack.core.process import in_one_blas_thread, progress, table, waiting
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import PROVENANCE, write_csv
-from vinetrack.core.terminal import progress, table, waiting
-from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number, pressure_text
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
@@ -205,7 +204,7 @@ def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
     yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
     rows = []
     for prediction in predictions:
-        speed, time = _quantity_row(prediction.final)[1:4], _quantity_row(prediction[vines.TIME])[2:4]
+        speed, time = _quantity_row(prediction.final)[1:4], _quantity_row(prediction["time to get there"])[2:4]
         rows.append((prediction.inputs.trial.condition, *speed, *time, f"{prediction.slack:.0%}"))
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")

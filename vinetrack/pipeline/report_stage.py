@@ -17,9 +17,9 @@ import numpy as np
 
 import vinetrack.results as layout
 from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
+from vinetrack.core.process import table
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
-from vinetrack.core.terminal import table
 from vinetrack.core.units import number
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import ExperimentSettings, FigureSettings, OverlaySettings, read_experiment_settings

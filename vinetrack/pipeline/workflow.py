@@ -31,8 +31,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems, remark
+from vinetrack.core.process import waiting
 from vinetrack.core.tables import write_bytes, write_text
-from vinetrack.core.terminal import waiting
 from vinetrack.results import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:

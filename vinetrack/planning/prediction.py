@@ -79,12 +79,6 @@ def drawn_final_speeds(
     return final_speeds(inputs.model, trials, at_fraction, rows)
 
 
-TIME = "time to get there"
-EDGE = "speed of the leading edge"
-EJECTION = "ejection speed of the payload"
-TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
-
-
 @dataclass(frozen=True)
 class Neglected:
     """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
@@ -122,7 +116,9 @@ class VinePrediction:
         """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`. Where the tail may
         go slack, the payload moves on its own and is not simulated: then that of the leading edge.
         """
-        return self[EJECTION if told_by_payload(self.inputs.trial) else EDGE]
+        return self[
+            "ejection speed of the payload" if told_by_payload(self.inputs.trial) else "speed of the leading edge"
+        ]
 
     def __getitem__(self, name: str) -> Band:
         """Return the quantity of that name; KeyError where there is none."""
@@ -149,7 +145,7 @@ class VinePrediction:
         if self.slack >= warned_from and trial.tail_slack == "free":
             found.append(remark("goes_slack", share=self.slack))
         elif self.slack >= warned_from:
-            tension, has_payload = self[LEAST_TENSION], trial.payload_kg > 0
+            tension, has_payload = self["least tension of the tail"], trial.payload_kg > 0
             facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
             found.append(remark("tail_compressed", share=self.slack, **facts))
         # The audit along the median motion, except of the tail, whose compression is told above
@@ -257,19 +253,19 @@ def predict_vine(
     if trial.payload_kg > 0:
         if told_by_payload(trial) or not slack.any():
             ejected_m_s = r * np.array([m.lead_velocity_m_s[-1] for m in moved])
-            tell(EJECTION, 1.0, np.where(np.isfinite(end_s), ejected_m_s, 0.0), "m/s")
+            tell("ejection speed of the payload", 1.0, np.where(np.isfinite(end_s), ejected_m_s, 0.0), "m/s")
         tell("time to the end", 1.0, end_s, "s")
-    tell(EDGE, at_fraction, lead_m_s[:, place], "m/s")
+    tell("speed of the leading edge", at_fraction, lead_m_s[:, place], "m/s")
     tell("speed of the tail", at_fraction, r * lead_m_s[:, place], "m/s")
-    tell(TIME, at_fraction, time_s[:, place], "s")
+    tell("time to get there", at_fraction, time_s[:, place], "s")
     if DAMPING in model.parameter_names:
         # Of (P − P_y)A = B ẋⁿ, without weight or further effects
         B, n = (rows[:, model.parameter_names.index(key)] for key in (DAMPING, EXPONENT))
         force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
         with np.errstate(divide="ignore", over="ignore"):
             tell("steady tail speed, Eq. (3)", math.nan, (force_N / B) ** (1 / n), "m/s")
-    tell(TENSION, at_fraction, tension_N[:, place], "N")
-    tell(LEAST_TENSION, math.nan, least_N, "N")
+    tell("tension of the tail", at_fraction, tension_N[:, place], "N")
+    tell("least tension of the tail", math.nan, least_N, "N")
     tell("hoop stress PD/2t", math.nan, np.array([stress_Pa]), "Pa")
 
     curve: dict[str, Any] = {"condition": trial.condition, "y_over_L": along, "lead_position_m": places_m}

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 # values is a measurement, and every output that uses them says so.
 
 # Table I and the damping law of Alvarez et al., IEEE Robotics and Automation Letters, 2025, from which the priors are;
-# what else they print stands in `vinetrack.paper.published`
+# what else they print stands in `paper.motions`
 SOURCE = "Alvarez et al. (2025)"
 DAMPING_B = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}  # Damping coefficient by scale R, N·(s/m)ⁿ
 DAMPING_R2 = {1: 0.964, 2: 0.981, 3: 0.896, 4: 0.971}  # R² of the power law at the steady points of each scale

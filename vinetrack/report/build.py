@@ -46,7 +46,7 @@ from vinetrack.narrative.verdict_text import (
     verdict_sentence,
     verdict_table,
 )
-from vinetrack.paper import published
+from vinetrack.planning.predictive_inputs import SOURCE
 from vinetrack.results import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.video.axis import Axis, axis_entry, axis_from_entry
@@ -245,7 +245,7 @@ def paper_section(table: pd.DataFrame, figures: Sequence[ReportFigure]) -> dict[
         "key": "paper",
         "title": "Comparison with the paper",
         "paragraphs": [
-            f"The numbers of {published.SOURCE} next to ours. {tally(table)} Each row is marked with its kind.",
+            f"The numbers of {SOURCE} next to ours. {tally(table)} Each row is marked with its kind.",
             f"{'; '.join(present)}.",
             "The errors of Eq. (2) at low pressure (1.90 cm at 7 kPa) are compared with those that a chamber without "
             "refill, and a tail that cannot push, would cause in the same vine. Neither is claimed to be the reason: "

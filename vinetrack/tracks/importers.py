@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import InputError
+from vinetrack.core.process import table
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
-from vinetrack.core.terminal import table
 from vinetrack.core.units import UNITS, number, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Checks that every imported track must pass, and how a track is assembled.
 
-FEWEST_POINTS = 5  # Fewest points of a track (derived)
+FEWEST_POINTS = 5  # Fewest points of a track, and frames of a recording (derived)
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 

@@ -15,8 +15,8 @@ from itertools import accumulate, product
 
 import numpy as np
 
+from vinetrack.core.process import njit
 from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
-from vinetrack.core.threads import njit
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.

@@ -19,10 +19,18 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, front_share
+from vinetrack.video.axis import (
+    END_FRAMES,
+    LEAST_FRONT_SHARE,
+    Axis,
+    SmallPictures,
+    axis_through,
+    column_after_leap,
+    dividing_path,
+    front_share,
+)
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.small_pictures import END_FRAMES, SmallPictures, column_after_leap, dividing_path
 from vinetrack.video.strip import Look, Positions, Strip, Tracker, calibrated_sigma, cut_strip, snap_to_grid
 
 # ------------------------------------------------------------------------------
@@ -192,7 +200,6 @@ def residual_sums(
 
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (chosen)
-OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
 
 
 def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
@@ -225,7 +232,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
             blurred = replace(blurred, edge=np.where(use, fit[:, 0], state.edge))
             misfits[k] = residual_sums(strip, blurred, fit, use, widest - coverage_reach(0.0, blurred.blur))[2]
         least = int(np.argmin(misfits))
-    return replace(state, blur=float(np.clip(_least_misfit(candidates, misfits), *OPTICAL_BLUR_PX)))
+    return replace(state, blur=_least_misfit(candidates, misfits))
 
 
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
@@ -384,7 +391,6 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
 LEAST_AMPLITUDE = 0.6  # Contrast, relative to that of other frames, below which too little is visible (chosen)
-NO_EDGE_PX = 2 * ASTRAY_PX  # Standard error stated where there is no edge
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
@@ -436,8 +442,8 @@ def _near_start(edge: Floats) -> Bools:
 
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
     """Error of the edge in frames in which a door hides the tip, 0 in others. There the edge is a guess; where the
-    picture differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames,
-    5); misfit_ratio, edge (n_frames,) → (n_frames,).
+    picture differs entirely from the model, or hardly any contrast is left, there is no edge, and its error is
+    infinite. Shapes: fit (n_frames, 5); misfit_ratio, edge (n_frames,) → (n_frames,).
     """
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     # 2.4, 1.6: misfit, over the usual one and in itself, above which a frame differs from those clear of the start
@@ -450,7 +456,7 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
         guess[earlier] = ASTRAY_PX
-    return np.where(covered, NO_EDGE_PX, guess)
+    return np.where(covered, np.inf, guess)
 
 
 # ------------------------------------------------------------------------------
@@ -738,7 +744,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     column = np.clip(np.rint(edge_now), tube.passed[0], tube.passed[1] - 1).astype(int)
     shared = 1.0 / np.maximum(contrast[column], 1.0)
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
-    guess = np.where(in_mouth, NO_EDGE_PX, hidden_errors(fit, ratio, edge_now))
+    guess = np.where(in_mouth, np.inf, hidden_errors(fit, ratio, edge_now))
     slow = np.sqrt(unseen**2 + shared**2 + guess**2 + _hidden_px(np.abs(difference).mean(axis=0), edge_now, tube) ** 2)
     # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
     # above which any is, since something adds to the edge (chosen)

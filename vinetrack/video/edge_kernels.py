@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from vinetrack.core.threads import njit
+from vinetrack.core.process import njit
 
 # ------------------------------------------------------------------------------
 # Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).

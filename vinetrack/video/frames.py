@@ -67,9 +67,9 @@ def film_shots(
             marks = stream.codec_context.name not in NON_MARKING_DECODERS
             faulty: set[int | None] = set()
             # With one thread each message belongs to the packet that is decoded; and one costs less where workers share
-            # the cores.
-            threads = DECODER_THREADS if marks and multiprocessing.parent_process() is None else 1
-            stream.thread_type, stream.codec_context.thread_count = "AUTO", threads
+            # the cores. Else FFmpeg chooses how many.
+            stream.thread_type = "AUTO"
+            stream.codec_context.thread_count = 0 if marks and multiprocessing.parent_process() is None else 1
             if span is not None:
                 container.seek(max(span[0], 0), stream=stream)
             for packet in container.demux(stream):
@@ -217,9 +217,6 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     if len(luma) >= 8:
         odd[: cut_off(small[:some])] = odd[len(luma) - cut_off(small[::-1][:some]) :] = True
     return odd
-
-
-DECODER_THREADS = 2  # Decoder threads per recording (chosen)
 
 
 class RecordingError(ValueError):

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.tracks.position_noise import FOURTH_DIFFERENCE
-from vinetrack.video.axis import Axis, axis_through
-from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.axis import Axis, SmallPictures, axis_through
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
 Picture = NDArray[np.float32]

@@ -20,19 +20,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import Problem, confirmed
+from vinetrack.core.process import progress, table
 from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
-from vinetrack.experiment.folder import SHEET
+from vinetrack.experiment.folder import SETTINGS, SHEET
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through
+from vinetrack.tracks.importers import FEWEST_POINTS
+from vinetrack.video.axis import Axis, axis_entry, axis_problem, axis_through, read_event
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.small_pictures import read_event
-from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, too_few, track_pixels
+from vinetrack.video.track import Tracking, in_metres, too_few, track_pixels
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -137,7 +137,7 @@ def list_recordings(folder: Path, depth: int = 4) -> list[str]:
         if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
             found.append(path.name)
         elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
-            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= FEWEST_FRAMES:
+            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= FEWEST_POINTS:
                 found.append(path.name)
             elif depth > 0:
                 found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
@@ -163,7 +163,7 @@ def _is_stack(path: Path) -> bool:
 
     if path.suffix.lower() in (".tif", ".tiff"):
         with contextlib.suppress(OSError), Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= FEWEST_FRAMES
+            return getattr(image, "n_frames", 1) >= FEWEST_POINTS
     return False
 
 
@@ -335,9 +335,6 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
     return vars(facts) | {"duration_s": facts.duration_s, "axis": axis}
 
 
-SETTINGS = "experiment.yaml"
-
-
 class Surveyor:
     """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
     trials whose recordings were tracked.
@@ -419,9 +416,9 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
     declared, present = recording.declared_frames, _frames_present(recording)
     if present is not None and declared is not None and present < declared:
         message = f"is cut short: {present} of the {declared} frames that it declares are there"
-        severity, remedy = "error" if present < FEWEST_FRAMES else "warning", "copy it from the camera again"
+        severity, remedy = "error" if present < FEWEST_POINTS else "warning", "copy it from the camera again"
         problems.append(Problem("cut_short", message, severity=severity, remedy=remedy, **place))
-    elif present is not None and present < FEWEST_FRAMES:
+    elif present is not None and present < FEWEST_POINTS:
         problems.append(Problem(message=too_few(present), remedy="name a film or a folder of pictures", **place))
     return problems
 

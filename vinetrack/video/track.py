@@ -13,20 +13,25 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, join_flags
 from vinetrack.tracks.frame_timing import correct_frames
+from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
-from vinetrack.video.axis import Axis, axis_problem, centred_on_motion, find_axis, find_growth_axis
+from vinetrack.video.axis import (
+    END_FRAMES,
+    Axis,
+    SmallPictures,
+    axis_problem,
+    busy_frames,
+    centred_on_motion,
+    column_after_leap,
+    dividing_path,
+    find_axis,
+    find_growth_axis,
+    read_event,
+)
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.edge import EdgeTracker
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.small_pictures import (
-    END_FRAMES,
-    SmallPictures,
-    busy_frames,
-    column_after_leap,
-    dividing_path,
-    read_event,
-)
 from vinetrack.video.strip import SLOW_PX, Look, Positions, Tracker, calibrated_sigma, cut_strip
 
 # ------------------------------------------------------------------------------
@@ -273,13 +278,10 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
     return mask
 
 
-FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
-
-
 def too_few(frames: int) -> str:
     """Say that a recording, or a picture taken for one, has too few frames."""
     what = "is a single picture" if frames == 1 else f"has {frames} frames"
-    return f"{what}; a track needs at least {FEWEST_FRAMES} frames"
+    return f"{what}; a track needs at least {FEWEST_POINTS} frames"
 
 
 # ------------------------------------------------------------------------------
@@ -507,13 +509,13 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
     either end; and notes on the others.
     """
     name = frames.recording.path.name
-    if len(frames) < FEWEST_FRAMES:
+    if len(frames) < FEWEST_POINTS:
         raise RecordingError(too_few(len(frames)), "name a film or a folder of pictures", name)
     odd = odd_frames(frames.luma)
     first, last = trial.frames_used or (0, len(frames.slots) - 1)
     number = frames.first + np.arange(len(frames))
     allowed: Bools = (number >= first) & (number <= last)
-    if allowed.sum() < FEWEST_FRAMES:
+    if allowed.sum() < FEWEST_POINTS:
         raise RecordingError(f"frames_used leaves {int(allowed.sum())} of {len(frames)} frames", "widen it", name)
     sound = sound_stretch(frames, allowed)
     odd &= sound

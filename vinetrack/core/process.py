@@ -1,21 +1,25 @@
-"""Terminal output: aligned tables with units, progress bars; and tables and figures in a notebook.
+"""How the program runs: what it shows, its compiled functions, and the threads of linear algebra.
 
-Progress is drawn by rich on standard error, and only on a terminal; piped or logged output stays plain.
+Tables are aligned, with units; progress is drawn by rich on standard error, and only on a terminal: piped or logged
+output stays plain. A notebook shows tables and figures. No result depends on the number of threads.
 """
 
 from __future__ import annotations
 
 import html
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import repeat, zip_longest
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from threadpoolctl import threadpool_limits
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.progress import Progress
+
 
 Item = TypeVar("Item")
 
@@ -73,3 +77,24 @@ class Drawn:
     def plot(self, name: str = "", **options: Any) -> Figure:
         """Return a figure of the report by its name; blank for the main one."""
         return cast("Figure", import_module("vinetrack.interface").figure_of(self, name, **options))
+
+
+THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
+
+
+def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function by numba; the compiled form is kept, unless no folder for it can be written."""
+    import numba
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **flags)(function)
+        except RuntimeError:
+            return numba.njit(**flags)(function)
+
+    return compiled
+
+
+# Decorates a function so that linear algebra in it uses one thread; afterwards as many as before. The matrices of a
+# fit are too small to be shared out: threads that wait for each other cost processor time.
+in_one_blas_thread = threadpool_limits.wrap(1, user_api="blas")
