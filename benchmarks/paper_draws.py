@@ -18,7 +18,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.paper import motions
-from vinetrack.paper.motions import END_FRACTION, LASTS_S, NONE, follow, position_rms_m, position_trials
+from vinetrack.paper.motions import END_FRACTION, LASTS_S, Departure, follow, position_rms_m, position_trials
 
 TRIALS, B_SCATTER, PRESSURE_SCATTER = 4, 0.03, 0.01
 PSI_PA, OTHER_YIELD_PA = 6894.76, 3200.0
@@ -26,12 +26,12 @@ PSI_PA, OTHER_YIELD_PA = 6894.76, 3200.0
 
 def mean_error_m(trial: Trial, draw: np.random.Generator) -> float:
     """Root mean square of the mean of four trials about Eq. (2), m."""
-    plain = follow(trial, NONE, motions.DAMPING_B[4])
+    plain = follow(trial, Departure(), motions.TABLE_I[4].B)
     grown: list[Floats] = []
     for _ in range(TRIALS):
-        B = motions.DAMPING_B[4] * math.exp(B_SCATTER * draw.standard_normal())
+        B = motions.TABLE_I[4].B * math.exp(B_SCATTER * draw.standard_normal())
         scattered = replace(trial, pressure_Pa=trial.pressure_Pa * (1 + PRESSURE_SCATTER * draw.standard_normal()))
-        grown.append(follow(scattered, NONE, B).lead_position_m)
+        grown.append(follow(scattered, Departure(), B).lead_position_m)
     stop = min(int(np.searchsorted(one, END_FRACTION * trial.length_m)) for one in (plain.lead_position_m, *grown))
     off_m = np.mean([one[:stop] for one in grown], axis=0) - plain.lead_position_m[:stop]
     return float(np.sqrt(np.mean(off_m**2)))
@@ -41,7 +41,7 @@ def otherwise_m(trial: Trial) -> float:
     """Root mean square between Eq. (2) as printed and with P_y 3.2 kPa at whole psi, m."""
     rounded_Pa = PSI_PA * round(trial.pressure_Pa / PSI_PA)
     other = replace(trial, pressure_Pa=rounded_Pa, yield_pressure_Pa=OTHER_YIELD_PA)
-    plain, moved = (follow(one, NONE, motions.DAMPING_B[4]) for one in (trial, other))
+    plain, moved = (follow(one, Departure(), motions.TABLE_I[4].B) for one in (trial, other))
     return position_rms_m(plain, moved, trial)
 
 

@@ -153,15 +153,9 @@ def read_result(path: Path) -> pd.DataFrame:
         with path.open(encoding="utf-8") as file:
             columns = file.readline().strip().split(",")
         numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS]
-        table = pd.read_csv(
-            path,
-            dtype={column: float if column in numbers else str for column in columns},
-            keep_default_na=False,
-            na_values={column: ["", "NaN"] for column in numbers},
-        )
-        for column in TRUTH_COLUMNS.intersection(columns):
-            table[column] = (table[column] == "True").astype(bool)
-    return table
+        kinds = {column: bool if column in TRUTH_COLUMNS else str for column in columns} | dict.fromkeys(numbers, float)
+        blank = {column: ["", "NaN"] for column in numbers}
+        return pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=blank)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -129,7 +129,7 @@ RESTS = {"a": TrialEstimates(0.03, origin_m=-0.01), "b": TrialEstimates(0.1, ori
 
 def filmed(**factors: float) -> dict[str, pd.DataFrame]:
     """Trials so many times as far as Eq. (2) at every instant, each on its own clock, still before and after."""
-    plain = motions.follow(TRIALS[0], motions.NONE, 6.44)
+    plain = motions.follow(TRIALS[0], motions.Departure(), 6.44)
     time_s = np.arange(0, 400) / 1069
     moved = {}
     for name, factor in factors.items():
@@ -144,7 +144,7 @@ def filmed(**factors: float) -> dict[str, pd.DataFrame]:
 def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     """1.1 times Eq. (2) is there first, when Eq. (2) has grown to 0.95 · 280/1.1 = 242 mm."""
     mean, _ = motions.position_tables(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9))
-    plain = motions.follow(TRIALS[0], motions.NONE, 6.44)
+    plain = motions.follow(TRIALS[0], motions.Departure(), 6.44)
     assert set(mean["pressure_kPa"]) == {28.0}
     assert mean["time_s"].min() == 0.0
     there_s = np.interp(0.95 * 0.28 / 1.1, plain.lead_position_m, plain.time_s)

@@ -192,27 +192,23 @@ def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):
     assert guess.read_sizes(text)[1] == sizes
 
 
-def printed(scale: int) -> tuple[float, float]:
-    return 1e-3 * motions.DIAMETER_MM[scale], 1e-6 * motions.THICKNESS_UM[scale]
-
-
 def test_the_guess_is_exact_for_the_largest_printed_vine_and_its_error_that_of_a_regression():
-    assert damping_prior(*printed(4)) == pytest.approx(6.44)
-    for scale, B in motions.DAMPING_B.items():
-        assert damping_prior(*printed(scale)) == pytest.approx(B, rel=0.18)
+    assert damping_prior(*guess.TABLE_I[4].size) == pytest.approx(6.44)
+    for printed in guess.TABLE_I.values():
+        assert damping_prior(*printed.size) == pytest.approx(printed.B, rel=0.18)
     # 6.44 (R/4)^1.75 = 0.5692, 1.9146, 3.8927, 6.44 against 0.57, 1.83, 4.54, 6.44; two of four numbers are used up.
     off = np.log([0.57 / 0.5692, 1.83 / 1.9146, 4.54 / 3.8927, 1.0])
     assert guess.damping_scatter() == pytest.approx(math.sqrt(np.sum(off**2) / 2), rel=1e-3)
-    z = np.log([damping_prior(*printed(scale)) for scale in motions.DAMPING_B])
+    z = np.log([damping_prior(*printed.size) for printed in guess.TABLE_I.values()])
     design = np.column_stack([np.ones(4), z])
     for size in ((25e-3, 100e-6), (2.5e-3, 50e-6), (100e-3, 400e-6)):
         row = np.array([1.0, math.log(damping_prior(*size))])
         expected = guess.damping_scatter() * math.sqrt(1 + row @ np.linalg.inv(design.T @ design) @ row)
         assert guess.damping_log_sigma(size) == pytest.approx(expected)
     # Carried over from another vine: both scatter about a line whose slope alone is in doubt.
-    step = math.log(damping_prior(25e-3, 100e-6) / damping_prior(*printed(4)))
+    step = math.log(damping_prior(25e-3, 100e-6) / damping_prior(*guess.TABLE_I[4].size))
     expected = guess.damping_scatter() * math.sqrt(2 + step**2 / np.sum((z - z.mean()) ** 2))
-    assert guess.damping_log_sigma((25e-3, 100e-6), printed(4)) == pytest.approx(expected)
+    assert guess.damping_log_sigma((25e-3, 100e-6), guess.TABLE_I[4].size) == pytest.approx(expected)
 
 
 PSI = 6.894757

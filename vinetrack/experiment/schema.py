@@ -1,7 +1,7 @@
 """Columns of the trial sheet: their table, the reading of single values, and the names of vines and conditions.
 
 `columns.csv` beside this file declares every column, a line each: the field of `Trial` that holds it, its kind, unit,
-bounds, meaning. It rules the reading of `trials.csv` (`sheet`), the settings of the same name in `experiment.yaml` and
+bounds, meaning. It rules the reading of `trials.csv` (`folder`), the settings of the same name in `experiment.yaml` and
 its `limits` (`settings`), the options of `vinetrack predict` and `design`, the inputs that an effect may require, and
 the output of `vinetrack settings`.
 

@@ -183,7 +183,7 @@ def draw_speed_scaling(scaling: dict[str, Any], pressure_unit: str = "kPa") -> F
     divided by the diameter (Fig. 8 of the paper). Points are means over a vine's steady trials with their standard
     errors (that of a single trial does not include replicate scatter); power laws (full) and straight lines (dashed)
     are fitted to the means of vines, so N is the number of vines, and p is the probability of a slope at least as
-    large if there is none. Pressures that agree within 1 % count as one.
+    large if there is none. Pressures that agree within 2 % count as one.
     """
     with_line = [one for one in scaling.get("steady_speed") or [] if not one.get("refused")]
     families = with_line[:5]  # each pressure has three lines of legend above the axes
@@ -287,17 +287,17 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
     for ax, part, (method, x, y, _, title) in zip(axes, steady, panels, strict=True):
         law = damping.get(method) or {}
         ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)")
-        for i, (scale, B) in enumerate(published.DAMPING_B.items()):
+        for i, (scale, vine) in enumerate(published.TABLE_I.items()):
             of_scale, colour = part[part["scale"] == scale], st.VINE_COLOURS[i]
             if not len(of_scale):
                 continue
             fitted = (law.get("vines") or {}).get(str(of_scale["vine"].iloc[0])) or {}
-            label = f"R = {scale}: B {number(fitted.get('B'))}, printed {B:g}; N = {len(of_scale)}"
+            label = f"R = {scale}: B {number(fitted.get('B'))}, printed {vine.B:g}; N = {len(of_scale)}"
             style: dict[str, Any] = {"mfc": st.PAPER, "mec": colour, "ms": 5, "mew": 1.1, "ls": "none"}
             ax.plot(of_scale[x], of_scale[y], st.VINE_MARKERS[i], label=label, **style)
             span = np.geomspace(float(of_scale[x].min()) / 1.2, float(of_scale[x].max()) * 1.2, 50)
-            printed = "printed B and n" if scale == max(published.DAMPING_B) else None
-            ax.plot(span, B * span**published.PRINTED_EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
+            printed = "printed B and n" if scale == max(published.TABLE_I) else None
+            ax.plot(span, vine.B * span**published.PRINTED_EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
             if fitted and law.get("n"):
                 ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
         n = with_interval(law.get("n"), law.get("n_95_total"))

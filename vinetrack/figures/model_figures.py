@@ -325,8 +325,6 @@ def _draw_map(
     ax.grid(visible=False)
 
 
-_LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
-
 # ------------------------------------------------------------------------------
 # Figures of designs: the fastest vine, and the pressure loss of a chamber.
 
@@ -389,6 +387,8 @@ def draw_reservoir(
 
 # ------------------------------------------------------------------------------
 # Predictions, and the motion with and without one effect.
+
+_LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
 
 
 @st.look()

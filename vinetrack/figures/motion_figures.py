@@ -297,7 +297,6 @@ def _draw_frame(panel: st.Panel, tracking: Tracking, frame: int, picture: np.nda
 # Frames of a clip.
 
 TRACKED = "#F0E442"  # yellow of Okabe and Ito: with vermillion and sky everyone tells it apart on any grey
-_BAR, _BAR_INK, _GREY = "#16191e", "#f2f4f7", "#9aa3b0"
 
 
 @dataclass(frozen=True)
@@ -356,14 +355,14 @@ class ClipView:
         from PIL import Image, ImageDraw
 
         width, line_px = self.picture_px[0], self.line_px
-        bar = Image.new("RGB", (width, _even(1.35 * line_px * max(len(self.edges), 2) + 0.8 * line_px)), _BAR)
+        bar = Image.new("RGB", (width, _even(1.35 * line_px * max(len(self.edges), 2) + 0.8 * line_px)), st.INK)
         pen = ImageDraw.Draw(bar)
         for i, edge in enumerate(self.edges):
             y, font = self.row_y(i), _font(line_px, edge.name, 0.42 * width)
             pen.line([(line_px, y), (2.6 * line_px, y)], fill=edge.colour, width=max(line_px // 4, 3))
-            pen.text((3.2 * line_px, y), edge.name, font=font, fill=_BAR_INK, anchor="lm")
+            pen.text((3.2 * line_px, y), edge.name, font=font, fill=st.PAPER, anchor="lm")
         font = _font(line_px, self.title, 0.3 * width)
-        pen.text((width - line_px, self.row_y(0)), self.title, font=font, fill=_BAR_INK, anchor="rm")
+        pen.text((width - line_px, self.row_y(0)), self.title, font=font, fill=st.PAPER, anchor="rm")
         return bar
 
     @cached_property
@@ -399,7 +398,7 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float) -
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
     if view.axis.bends:  # a straight axis is obvious
-        pen.line([tuple(place) for place in view.at(np.arange(0.0, view.axis.length_px, 3.0))], fill=_GREY, width=1)
+        pen.line([tuple(place) for place in view.at(np.arange(0.0, view.axis.length_px, 3.0))], fill=st.MUTED, width=1)
     thick = max(round(width / 320), 3)
     for edge in sorted(view.edges, key=lambda edge: -edge.reach):
         along = float(edge.along_px[frame])
@@ -416,12 +415,12 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float) -
     for i, edge in enumerate(view.edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
             words = f"{st.with_minus(edge.off_mm[frame], '+.1f')} mm"
-            pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=_BAR_INK, anchor="rm")
+            pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=st.PAPER, anchor="rm")
     words = f"frame {frame}"
     if math.isfinite(time_ms):
         before = " (before release)" if time_ms < 0 else ""
         words = f"{st.with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
-    pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
+    pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=st.GRID, anchor="rm")
     return np.asarray(whole)
 
 

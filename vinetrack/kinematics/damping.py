@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
 
-NO_SLOPE = "its vine carries no slope: "  # Start of the reason of a point whose vine is left out of the law
-
-
 @dataclass(frozen=True)
 class Points:
     """Steady points in logarithms, shape (n_points,); errors are relative, `yield_error` is in N. `vine` is the index
@@ -59,11 +56,7 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     """Fit the law to the steady windows by both methods, and exactly as published. Returns `log_log`, `both_axes`,
     `paper`, each as `fit_damping` describes.
     """
-    in_law = points["used"]
-    if "reason" in points:
-        # Vines without a slope are passed on, so that `fit_damping` leaves them out with the reason.
-        in_law = in_law | points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
-    fits = fit_damping(points[in_law], resamples=resamples, seed=seed)
+    fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
     return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
@@ -83,12 +76,12 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
     return marked
 
 
-def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
-    """Exclude the points of half-steady conditions and of vines without a slope, in `used` and `reason`."""
-    marked = mark_half_steady(points)
-    for vine, why in _admit(marked[marked["used"]])[1].items():
+def mark_left_out(points: pd.DataFrame, left_out: Mapping[str, str]) -> pd.DataFrame:
+    """Exclude the points of vines that a law left out, each with the reason, in `used` and `reason`."""
+    marked = points.copy()
+    for vine, why in left_out.items():
         of_vine = marked["used"] & (marked["vine"] == vine)
-        marked.loc[of_vine, "reason"] = NO_SLOPE + why
+        marked.loc[of_vine, "reason"] = f"its vine carries no slope: {why}"
         marked.loc[of_vine, "used"] = False
     return marked
 
@@ -317,7 +310,7 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # Slopes are those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as
 # large if there is none.
 
-SAME_WITHIN = 0.02  # Sizes, their ratios and settings that agree within this fraction count as equal (chosen)
+SAME_WITHIN = 0.02  # Sizes and settings that agree within this fraction count as equal, ratios within twice it (chosen)
 
 
 def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -404,7 +397,8 @@ def alike(table: pd.DataFrame, columns: Iterable[str]) -> list[pd.DataFrame]:
         first = left.iloc[0]
         same = np.ones(len(left), dtype=bool)
         for column in columns:
-            same &= np.isclose(left[column].to_numpy(float), float(first[column]), rtol=SAME_WITHIN, atol=1e-12)
+            within = (2 if column == "wall_over_diameter" else 1) * SAME_WITHIN
+            same &= np.isclose(left[column].to_numpy(float), float(first[column]), rtol=within, atol=1e-12)
         groups.append(left[same])
         left = left[~same]
     return groups

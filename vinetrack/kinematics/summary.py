@@ -22,7 +22,7 @@ from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
 from vinetrack.experiment.settings import RunSettings
-from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left_out
+from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_half_steady
 from vinetrack.kinematics.steady import (
     SteadyForce,
     TrialMotion,
@@ -511,7 +511,7 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
             reasons.append(str(error))
     if not rows:
         raise ValueError(f"no trial can be analysed under this model: {'; '.join(reasons) or 'there is none'}")
-    points = mark_left_out(pd.DataFrame(rows))
+    points = mark_half_steady(pd.DataFrame(rows))
     return fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
 
 

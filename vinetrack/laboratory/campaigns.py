@@ -197,7 +197,7 @@ def campaign(
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
     """Parameters of isometric vines as `GroundTruth.values` takes them: the printed B by vine, N·(s/m)ⁿ, and n."""
-    by_vine = {trial.vine: motions.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
+    by_vine = {trial.vine: motions.TABLE_I[round(trial.diameter_m / 6e-3)].B for trial in trials}
     return {DAMPING: by_vine, EXPONENT: motions.PRINTED_EXPONENT}
 
 

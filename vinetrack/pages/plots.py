@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, with_flag
-from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
+from vinetrack.figures.style import GRID, INK, MUTED, ORANGE, SKY, VERMILLION, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import TEMPLATES, jpeg
@@ -281,7 +281,7 @@ class Plots:
 # second of a high-speed camera takes a few tens of megabytes.
 
 # Name, colour over a grey picture, and line of each edge that is drawn
-EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), ("model", "#D55E00", "dashed"))
+EDGES = (("tracked", SKY, "solid"), ("comparison", ORANGE, "dotted"), ("model", VERMILLION, "dashed"))
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,8 @@ from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
 from vinetrack.planning.prediction import gauge_left
 from vinetrack.planning.predictive_inputs import (
-    DAMPING_B,
-    DIAMETER_MM,
     PRINTED_EXPONENT,
-    THICKNESS_UM,
+    TABLE_I,
     YIELD_PRESSURE_KPA,
     damping_prior,
 )
@@ -56,8 +54,10 @@ FAST_VINE = {"thickness_um": 100.0, "diameter_mm": 25.0, "length_mm": 400.0, "pr
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:
     """Return the scale R of the vine of Table I with this size, to within 1 %; None for any other."""
-    off = {R: (abs(diameter_mm / DIAMETER_MM[R] - 1), abs(thickness_um / THICKNESS_UM[R] - 1)) for R in DIAMETER_MM}
-    return next((scale for scale, parts in off.items() if all(part < 0.01 for part in parts)), None)
+    for scale, vine in TABLE_I.items():
+        if abs(diameter_mm / vine.diameter_mm - 1) < 0.01 and abs(thickness_um / vine.thickness_um - 1) < 0.01:
+            return scale
+    return None
 
 
 def area_m2(diameter_mm: float) -> float:
@@ -77,7 +77,7 @@ LASTS_S = 60.0  # Duration of the simulated motions, s; the slowest, at 7 kPa, t
 class Departure:
     """A departure from Eq. (2): `gamma` of a chamber that is not refilled (None: refilled), and a slack tail."""
 
-    name: str
+    name: str = "eq2"
     gamma: float | None = None
     slack: bool = False
 
@@ -89,7 +89,6 @@ class Departure:
         return model.with_values({"eversion_damping.B": B, "eversion_damping.n": PRINTED_EXPONENT})
 
 
-NONE = Departure("eq2")
 DEPARTURES = (
     Departure("depletion_slow", gamma=1.0),  # Chamber not refilled, isothermal
     Departure("depletion_fast", gamma=1.4),  # Chamber not refilled, adiabatic
@@ -118,7 +117,7 @@ def paper_trial(
 
 def position_trials() -> list[Trial]:
     """Return the trials of the paper's Fig. 4: the 24 mm × 200 µm vine, as long as the longest, with its payload."""
-    size = (DIAMETER_MM[4], THICKNESS_UM[4], LONGEST_VINE_MM)
+    size = (TABLE_I[4].diameter_mm, TABLE_I[4].thickness_um, LONGEST_VINE_MM)
     return [paper_trial(*size, pressure_kPa, PAYLOAD_G) for pressure_kPa in POSITION_RMS_CM]
 
 
@@ -126,13 +125,13 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
     """Compute the differences of each departure from Eq. (2)."""
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
-        plain = follow(trial, NONE, DAMPING_B[4])
+        plain = follow(trial, Departure(), TABLE_I[4].B)
         for departure in DEPARTURES:
-            moved = follow(trial, departure, DAMPING_B[4])
+            moved = follow(trial, departure, TABLE_I[4].B)
             rms_m = position_rms_m(plain, moved, trial)
             rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
     for pressure_kPa in FINAL_SPEED_RMS_M_S:
-        size = (DIAMETER_MM[4], FINAL_SPEED_THICKNESS_UM, LONGEST_VINE_MM)
+        size = (TABLE_I[4].diameter_mm, FINAL_SPEED_THICKNESS_UM, LONGEST_VINE_MM)
         trials = [paper_trial(*size, pressure_kPa, payload_g) for payload_g in payloads_g]
         plain_m_s = [final_speed_m_s(trial) for trial in trials]
         for departure in DEPARTURES:
@@ -159,8 +158,8 @@ def motion_table() -> pd.DataFrame:
     """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, 200 instants of each."""
     parts = []
     for trial in position_trials():
-        for departure in (NONE, *DEPARTURES):
-            moved = follow(trial, departure, DAMPING_B[4])
+        for departure in (Departure(), *DEPARTURES):
+            moved = follow(trial, departure, TABLE_I[4].B)
             end_s = moved.end_time_s if math.isfinite(moved.end_time_s) else LASTS_S
             time_s = np.linspace(0, end_s, 200)
             motion = {"time_s": time_s, "lead_position_m": np.interp(time_s, moved.time_s, moved.lead_position_m)}
@@ -188,7 +187,7 @@ def pressure_table() -> pd.DataFrame:
 def speeds_at(fractions: Sequence[float], case: Mapping[str, float]) -> list[float]:
     """Compute the speed of a vine's leading edge by Eq. (2), B from the scaling prior, at fractions of its length."""
     trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
-    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
+    model = Departure().model(damping_prior(trial.diameter_m, trial.thickness_m))
     motion = simulate(model, trial, np.linspace(0, 0.05, 50_001))
     return [lead_velocity_at(motion.lead_position_m, motion.lead_velocity_m_s, f * trial.length_m) for f in fractions]
 
@@ -210,13 +209,13 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
     # 10.0: duration of the simulated motions, s (chosen)
     time_s = np.arange(0, 10.0, 1 / CAPTURE_FPS)
     rows = []
-    for scale, B in DAMPING_B.items():
+    for scale, vine in TABLE_I.items():
         of_scale = [
             replace(trial, chamber_m3=CHAMBER_L / 1e3, yield_pressure_Pa=1e3 * YIELD_PRESSURE_KPA)
             for trial in trials
             if scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m) == scale
         ]
-        runs = simulate_many(departure.model(B), of_scale, [time_s] * len(of_scale))
+        runs = simulate_many(departure.model(vine.B), of_scale, [time_s] * len(of_scale))
         rows += [_point(scale, trial, moved) for trial, moved in zip(of_scale, runs, strict=True)]
     law = fit_laws(pd.DataFrame(rows), resamples=100)["paper"]
     return float(law["n"]), {int(vine): float(vine_law["B"]) for vine, vine_law in law["vines"].items()}
@@ -287,7 +286,7 @@ def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
     """Trials of Fig. 4, the 24 mm × 200 µm vine with the paper's payload, by pressure in kPa; one condition each."""
     conditions: dict[float, list[Trial]] = {}
     for pressure_kPa in POSITION_RMS_CM:
-        alike = [trial for trial in trials if _is(trial, THICKNESS_UM[4], pressure_kPa, PAYLOAD_G)]
+        alike = [trial for trial in trials if _is(trial, TABLE_I[4].thickness_um, pressure_kPa, PAYLOAD_G)]
         if alike:
             conditions[float(pressure_kPa)] = [trial for trial in alike if trial.condition == alike[0].condition]
     return conditions
@@ -305,7 +304,7 @@ def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
 
 def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float | None = None) -> bool:
     ours = (1e3 * trial.diameter_m, 1e6 * trial.thickness_m, trial.pressure_Pa / 1e3, 1e3 * trial.payload_kg)
-    printed = (DIAMETER_MM[4], thickness_um, pressure_kPa, payload_g)
+    printed = (TABLE_I[4].diameter_mm, thickness_um, pressure_kPa, payload_g)
     return all(two is None or math.isclose(one, two, rel_tol=0.02) for one, two in zip(ours, printed, strict=True))
 
 
@@ -342,7 +341,7 @@ def position_tables(
         sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
         columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
         parts.append(pd.DataFrame(dict(zip(names, columns, strict=True))))
-        plain = follow(trials[0], NONE, DAMPING_B[4])
+        plain = follow(trials[0], Departure(), TABLE_I[4].B)
         stop = int(np.searchsorted(plain.lead_position_m, END_FRACTION * trials[0].length_m))
         counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
         off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
@@ -370,11 +369,11 @@ def final_speeds(conditions: Mapping[str, list[Trial]], grown: Mapping[str, pd.D
     return pd.DataFrame(rows, columns=list(SPEED_COLUMNS))
 
 
-def final_speed_m_s(trial: Trial, departure: Departure = NONE) -> float:
+def final_speed_m_s(trial: Trial, departure: Departure = Departure()) -> float:
     """Return the speed of the leading edge at the paper's 12 cm by Eq. (2), or with a departure from it; 0 where it
     does not get there. B of Fig. 5's vine is not printed and taken as proportional to the wall.
     """
-    B = DAMPING_B[4] * 1e6 * trial.thickness_m / THICKNESS_UM[4]
+    B = TABLE_I[4].B * 1e6 * trial.thickness_m / TABLE_I[4].thickness_um
     moved = follow(trial, departure, B)
     speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, FINAL_SPEED_AT_MM / 1e3)
     return speed if math.isfinite(speed) else 0.0

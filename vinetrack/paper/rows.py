@@ -24,7 +24,7 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.damping import regress
 from vinetrack.paper import motions
 from vinetrack.planning.prediction import GAMMAS, gauge_left
-from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, DAMPING_R2, SOURCE, damping_prior, hoop_stress_Pa
+from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, SOURCE, TABLE_I, damping_prior, hoop_stress_Pa
 
 SIMULATED = "simulated from printed parameters"
 MEASURED = "measured"
@@ -94,15 +94,12 @@ def row_of(
 def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> Iterator[Row]:
     """Compare the protocol of an experiment with that of the paper."""
     bare = [trial for trial in trials if trial.payload_kg == 0 and trial.travel_ratio == 2]
-    by_scale = {
-        R: [t for t in bare if motions.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == R]
-        for R in motions.DAMPING_B
-    }
+    by_scale = {R: [t for t in bare if motions.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == R] for R in TABLE_I}
     for R, vines in by_scale.items():
         thickness_um = _mean([1e6 * trial.thickness_m for trial in vines])
         diameter_mm = _mean([1e3 * trial.diameter_m for trial in vines])
-        yield row_of("thickness_R{R}", thickness_um, published_as=motions.THICKNESS_UM[R], mark=mark, R=R)
-        yield row_of("diameter_R{R}", diameter_mm, published_as=motions.DIAMETER_MM[R], mark=mark, R=R)
+        yield row_of("thickness_R{R}", thickness_um, published_as=TABLE_I[R].thickness_um, mark=mark, R=R)
+        yield row_of("diameter_R{R}", diameter_mm, published_as=TABLE_I[R].diameter_mm, mark=mark, R=R)
         yield row_of("press_R{R}", published_as={1: 110.0, 2: 82.0, 3: 96.0, 4: 96.0}[R], R=R)  # °C, as printed
         yield row_of("laser_R{R}", published_as={1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}[R], R=R)  # %, as printed
     for R, vines in by_scale.items():
@@ -179,13 +176,13 @@ def _law_rows(mark: str, damping: Mapping[str, Any]) -> Iterator[Row]:
     for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
         interval = _bounds(law.get("n_95_total"))
         yield row_of(row, or_nan(law.get("n")), interval, published_as=motions.PRINTED_EXPONENT, mark=mark)
-    for R, printed in motions.DAMPING_B.items():
+    for R, printed in TABLE_I.items():
         log_log, ours, literal = (_vine_of(law, R) for law in laws.values())
         B, interval, n = or_nan(ours.get("B")), _bounds(ours.get("B_95_total")), ours.get("n_trials", 0)
         by_rule: Row = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
-        yield row_of("B_R{R}", B, interval, published_as=printed, mark=mark, R=R, n=n, **by_rule)
+        yield row_of("B_R{R}", B, interval, published_as=printed.B, mark=mark, R=R, n=n, **by_rule)
         R2 = or_nan(log_log.get("R2"))
-        yield row_of("R2_R{R}", R2, published_as=DAMPING_R2[R], mark=mark, R=R)
+        yield row_of("R2_R{R}", R2, published_as=printed.R2, mark=mark, R=R)
 
 
 def _vine_of(law: Mapping[str, Any], R: int) -> Mapping[str, Any]:
@@ -333,11 +330,10 @@ def weight_over_gas(diameter_mm: float) -> float:
 
 def computed_rows() -> Iterator[Row]:
     """Yield every row of the table that needs no experiment and no simulation."""
-    walls_um, diameters_mm = motions.THICKNESS_UM, motions.DIAMETER_MM
-    for R in motions.DAMPING_B:
-        relative = walls_um[R] / diameters_mm[R] / (walls_um[1] / diameters_mm[1])
+    for R, printed in TABLE_I.items():
+        relative = printed.thickness_um / printed.diameter_mm / (TABLE_I[1].thickness_um / TABLE_I[1].diameter_mm)
         yield row_of("isometry_R{R}", relative, published_as=1.0, R=R)
-    change = motions.volume_change(motions.CHAMBER_L / 1e3, max(diameters_mm.values()), motions.LONGEST_VINE_MM)
+    change = motions.volume_change(motions.CHAMBER_L / 1e3, TABLE_I[4].diameter_mm, motions.LONGEST_VINE_MM)
     printed_change, allowed = 100 * motions.CHAMBER_CHANGE, 100 * motions.CHAMBER_ALLOWED
     yield row_of("chamber_volume_change", 100 * change, published_as=printed_change)
     for kPa in sorted(motions.POSITION_RMS_CM, reverse=True):
@@ -345,18 +341,18 @@ def computed_rows() -> Iterator[Row]:
             drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
             facts: Row = {"kPa": kPa, "speed": law.split(",")[0], "process": law.split()[1]}
             yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed_change, allowed=allowed, **facts)
-    R2, n = motions.STEADY_SPEED_R2, len(motions.DAMPING_B)
+    R2, n = motions.STEADY_SPEED_R2, len(TABLE_I)
     yield row_of("steady_speed_p_value", p_value(R2, n), published_as=0.32, n=n)  # 0.32: as printed
-    scales, B = (np.array(list(values), dtype=float) for values in (motions.DAMPING_B, motions.DAMPING_B.values()))
+    scales, B = np.array([(R, printed.B) for R, printed in TABLE_I.items()]).T
     power, line = regress(np.log(scales), np.log(B)), regress(scales, B)
     yield row_of("B_power_of_scale", power["slope"], power["slope_95"])
     yield row_of("B_line_R2", line["R2"])
     yield row_of("B_line_intercept", line["intercept"], line["intercept_95"])
     gauge_Pa, yield_Pa = 1e3 * motions.STEADY_SPEED_KPA, 1e3 * motions.YIELD_PRESSURE_KPA
-    for R, printed in motions.DAMPING_B.items():
+    for R, printed in TABLE_I.items():
         # By Eq. (3)
-        forces_N = [(gauge_Pa - least_Pa) * motions.area_m2(diameters_mm[R]) for least_Pa in (0.0, yield_Pa)]
-        bare, with_yield = ((force_N / printed) ** (1 / motions.PRINTED_EXPONENT) for force_N in forces_N)
+        forces_N = [(gauge_Pa - least_Pa) * motions.area_m2(printed.diameter_mm) for least_Pa in (0.0, yield_Pa)]
+        bare, with_yield = ((force_N / printed.B) ** (1 / motions.PRINTED_EXPONENT) for force_N in forces_N)
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
@@ -366,9 +362,8 @@ def computed_rows() -> Iterator[Row]:
     slow, fast = (100 * (1 - gauge_left(1e3 * 48.0, change, gamma)) for gamma in GAMMAS.values())
     yield row_of("injector_volume_change", 100 * change, published_as=injected)
     yield row_of("injector_gauge_drop", slow, published_as=injected, fast=fast)
-    for R, printed in motions.DAMPING_B.items():
-        guess = damping_prior(diameters_mm[R] / 1e3, walls_um[R] / 1e6)
-        yield row_of("guessed_B_R{R}", guess, published_as=printed, R=R)
+    for R, printed in TABLE_I.items():
+        yield row_of("guessed_B_R{R}", damping_prior(*printed.size), published_as=printed.B, R=R)
     vine = motions.FAST_VINE
     stress_Pa = hoop_stress_Pa(1e3 * vine["pressure_kPa"], vine["diameter_mm"] / 1e3, vine["thickness_um"] / 1e6)
     yield row_of("fast_vine_hoop_stress", stress_Pa / 1e6, burst_MPa=BURST_STRESS_PA / 1e6)
@@ -404,7 +399,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
         scale = motions.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
         if scale is not None and trial.payload_kg == 0 and trial.travel_ratio == 2:
             chosen.setdefault(trial.condition, trial)
-    if len(chosen) < len(motions.DAMPING_B):
+    if len(chosen) < len(TABLE_I):
         return
     cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
     for row, gamma in cases.items():

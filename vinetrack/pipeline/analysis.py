@@ -48,7 +48,7 @@ from vinetrack.figures.style import blank
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
-from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
+from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_half_steady, mark_left_out
 from vinetrack.kinematics.summary import (
     TrialError,
     TrialMotion,
@@ -250,20 +250,22 @@ def draw_trial(results: Results, trial: Trial | None, name: str, windows: Sequen
 
 
 def fit_damping(job: Job) -> list[str]:
-    """Gather the trials; fit the damping law and its scaling with size, and write `damping.json` and `scaling.json`."""
-    table, results, settings = (
-        gather(job.experiment, job.results, job.settings),
-        Results(job.results),
-        job.settings,
-    )
-    law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
+    """Gather the trials; fit the damping law and its scaling with size, and write `damping.json` and `scaling.json`,
+    and `damping_points.csv` with the reason of each point that the law leaves out.
+    """
+    table, points = gather(job.experiment, job.results, job.settings)
+    results, settings = Results(job.results), job.settings.damping
+    law = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
+    write_csv(results.points, mark_left_out(points, law["both_axes"]["left_out"]))
     write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
     write_json(results.damping, law)
     return [failures_told(table)[0] or f"{len(table)} trials.", damping_headline(law)]
 
 
-def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
-    """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
+def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Gather the results of all trials in `trials.csv`, `conditions.csv` and `steady.csv`. Returns the first of these,
+    and the points of the damping law.
+    """
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     if experiment.settings.axis is None:
@@ -284,17 +286,13 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     points = table_of(POINT_COLUMNS, [content["point"] for content in analysed.values() if content["point"]])
     evaluated_at = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
     write_csv(results.steady, windows)
-    write_csv(results.points, mark_left_out(points))
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
-    return table
+    return table, mark_half_steady(points)
 
 
 # ------------------------------------------------------------------------------
 # The model in use: its fit to the tracks in `tracks/`, comparison with them, and audit of neglected effects.
-
-
-log = logging.getLogger(__name__)
 
 
 def fit_and_diagnose(job: Job) -> list[str]:

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -42,26 +42,42 @@ if TYPE_CHECKING:
 # Table I and the damping law of Alvarez et al., IEEE Robotics and Automation Letters, 2025, from which the priors are;
 # what else they print stands in `paper.motions`
 SOURCE = "Alvarez et al. (2025)"
-DAMPING_B = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}  # Damping coefficient by scale R, N·(s/m)ⁿ
-DAMPING_R2 = {1: 0.964, 2: 0.981, 3: 0.896, 4: 0.971}  # R² of the power law at the steady points of each scale
 PRINTED_EXPONENT = 0.37  # Damping exponent n, one for all scales (published)
-THICKNESS_UM = {1: 50.0, 2: 100.0, 3: 150.0, 4: 200.0}
-DIAMETER_MM = {1: 6.0, 2: 12.0, 3: 18.0, 4: 24.0}  # The four isometric vines of Table I
 YIELD_PRESSURE_KPA = 3.0  # Yield pressure of the 24 mm × 200 µm vine, R = 4 (published)
 
 SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
-# Diameter and thickness, m, of the printed vines, by their scale R
-PRINTED_SIZES = {R: (1e-3 * DIAMETER_MM[R], 1e-6 * THICKNESS_UM[R]) for R in DAMPING_B}
+
+class PrintedVine(NamedTuple):
+    """A vine of Table I, its damping coefficient, N·(s/m)ⁿ, and R² of the power law at its steady points."""
+
+    diameter_mm: float
+    thickness_um: float
+    B: float
+    R2: float
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Diameter and thickness, m."""
+        return 1e-3 * self.diameter_mm, 1e-6 * self.thickness_um
+
+
+# The four isometric vines, by their scale R
+TABLE_I = {
+    1: PrintedVine(6.0, 50.0, 0.57, 0.964),
+    2: PrintedVine(12.0, 100.0, 1.83, 0.981),
+    3: PrintedVine(18.0, 150.0, 4.54, 0.896),
+    4: PrintedVine(24.0, 200.0, 6.44, 0.971),
+}
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
     """The prior of B of a vine of this size, N·(s/m)ⁿ."""
-    largest = max(PRINTED_SIZES)
-    diameter, thickness = PRINTED_SIZES[largest]
-    return DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
+    largest = TABLE_I[max(TABLE_I)]
+    diameter, thickness = largest.size
+    return largest.B * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
 def damping_scatter() -> float:
@@ -70,7 +86,7 @@ def damping_scatter() -> float:
     >>> round(damping_scatter(), 3)
     0.113
     """
-    residuals = [math.log(DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
+    residuals = [math.log(one.B / damping_prior(*one.size)) for one in TABLE_I.values()]
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
@@ -79,7 +95,7 @@ def damping_log_sigma(size: tuple[float, float], like: tuple[float, float] | Non
     fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the logarithm of the size; or carried
     over from a vine `like` it, which scatters as well, σ √(1 + 1 + (z − z_like)²/Σ(zᵢ − z̄)²).
     """
-    printed = [math.log(damping_prior(*each)) for each in PRINTED_SIZES.values()]
+    printed = [math.log(damping_prior(*one.size)) for one in TABLE_I.values()]
     middle = sum(printed) / len(printed)
     start, doubt = (middle, 1 / len(printed)) if like is None else (math.log(damping_prior(*like)), 1.0)
     distance = math.log(damping_prior(*size)) - start
@@ -88,7 +104,7 @@ def damping_log_sigma(size: tuple[float, float], like: tuple[float, float] | Non
 
 def _split_leverage(diameter_m: float, thickness_m: float) -> float:
     """Change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D as printed."""
-    diameter, thickness = PRINTED_SIZES[max(PRINTED_SIZES)]
+    diameter, thickness = TABLE_I[max(TABLE_I)].size
     return math.log(thickness_m / diameter_m / (thickness / diameter))
 
 
@@ -100,7 +116,7 @@ def exponent_sigma() -> float:
     0.012
     """
     dof = (8 + 11) / 2 - 2
-    variances = [PRINTED_EXPONENT**2 * (1 - R2) / R2 / dof for R2 in DAMPING_R2.values()]
+    variances = [PRINTED_EXPONENT**2 * (1 - one.R2) / one.R2 / dof for one in TABLE_I.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
@@ -336,7 +352,7 @@ class _Assembly:
         self.trial, self.stated, self.fit = trial, stated, fit
         self.vine, self.is_same = ("", False) if fit is None else fit.vine_for(trial)
         self.size = trial.diameter_m, trial.thickness_m
-        self.printed_scale = next((R for R, printed in PRINTED_SIZES.items() if _alike(printed, self.size)), None)
+        self.printed = next((one for one in TABLE_I.values() if _alike(one.size, self.size)), None)
         self.values: dict[str, float] = {}
         self.origins: dict[str, Remark] = {}
         self.uncertainties: list[Uncertainty] = []
@@ -375,10 +391,10 @@ class _Assembly:
             self.vary(DAMPING, error, "error of B", f"B given|{vine}", why, log=True)
         elif fit is not None and place is not None and (self.is_same or fit.fit.numbers[place].vine == ""):
             self.set_fitted(DAMPING, place)
-        elif place is None and self.printed_scale is not None:
+        elif place is None and self.printed is not None:
             error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
             why = remark("B_printed", percent=100 * error)
-            self.set(DAMPING, DAMPING_B[self.printed_scale], "printed", source=SOURCE)
+            self.set(DAMPING, self.printed.B, "printed", source=SOURCE)
             self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, log=True)
         else:
             # The uncertainties are the scatter of the printed values about the prior, and the exponents of t against D.
@@ -428,7 +444,7 @@ class _Assembly:
             self.set(YIELD, stated, "given")
             why = remark("P_y_stated", sigma=(sigma, trial.pressure_unit))
             self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
-        elif self.printed_scale == 4:  # the vine whose yield pressure is printed
+        elif self.printed == TABLE_I[4]:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
             self.set(YIELD, printed_Pa, "printed", source=SOURCE)
             why = remark("P_y_printed", sigma=(rounding_Pa, trial.pressure_unit))

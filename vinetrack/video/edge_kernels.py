@@ -17,15 +17,14 @@ from vinetrack.core.process import njit
 # Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).
 #
 # The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that
-# a row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run
+# a row of pixels reads every SUBPIXEL_STEPS-th entry; the table is stored in that order, so that inner loops run
 # over neighbours in memory, without a branch.
 #
 # Functions that other compiled ones call are inlined: each caller would hold a copy of its own, with other last digits,
 # and the process that compiles them would run another one than those that load them.
 
-TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
 MIN_MOTION_BLUR_PX = 0.02  # Shorter motion blurs are set to this length (derived)
-SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)  # Entries of the coverage table per pixel (derived)
+SUBPIXEL_STEPS = 20  # Entries of the coverage table per pixel (derived)
 FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
@@ -38,9 +37,9 @@ def _normal(z: float) -> tuple[float, float]:
 
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
-    """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
-    TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
-    `length`, from ∫Φ = zΦ(z) + φ(z). Beyond `coverage_reach` it is 0 or 1. Shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2).
+    """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k +
+    j/n, with n = SUBPIXEL_STEPS and middle = ceil(half) + 1. p is the mean of the normal distribution function over a
+    box of `length`, from ∫Φ = zΦ(z) + φ(z). Beyond `coverage_reach` it is 0 or 1. Shape (2, n + 1, 2 middle + 2).
     """
     middle = math.ceil(half) + 1
     length = max(length, MIN_MOTION_BLUR_PX)
@@ -50,7 +49,7 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     # One half is the other one mirrored: p(−x) = 1 − p(x).
     for k in range(middle + 1):
         for j in range(SUBPIXEL_STEPS + 1):
-            x = middle - k + j * TABLE_STEP_PX
+            x = middle - k + j / SUBPIXEL_STEPS
             table[0, j, k] = 1.0
             if x < reach:
                 cdf_a, sum_a = _normal((x + length / 2) / blur)
@@ -74,7 +73,7 @@ def subpixel_index(place: float) -> tuple[int, int, float]:
     fraction; weight of entry j + 1.
     """
     whole = math.floor(place)
-    fraction = (place - whole) / TABLE_STEP_PX
+    fraction = (place - whole) * SUBPIXEL_STEPS
     j = min(int(fraction), SUBPIXEL_STEPS - 1)
     return int(whole), j, fraction - j
 

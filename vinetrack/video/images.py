@@ -30,7 +30,7 @@ from vinetrack.video.frames import (
 # ------------------------------------------------------------------------------
 # Rate and exposure of capture: what the recording states, else the sheet; never the playback rate.
 
-SAME_WITHIN = 0.01  # Relative difference within which two rates, or exposures of frames, are the same (chosen)
+SAME_RATE = 0.005  # Relative difference within which two rates are the same (derived)
 
 
 def capture_rate(trial: Trial, recording: Recording) -> float:
@@ -44,7 +44,7 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
     if not np.isfinite(stated):
         raise RecordingError("capture_fps is missing", "the file knows its playback rate only", trial.name)
     playback = recording.playback_fps
-    if playback and abs(stated / playback - 1) < SAME_WITHIN and not trial.capture_fps_is_playback:
+    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
         raise RecordingError(
             f"capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g})",
             "write the rate of capture, or capture_fps_is_playback: yes where it plays as fast as it was captured",
@@ -58,7 +58,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
     true_s, stated_s = recording.exposure_s, trial.exposure_s
     if true_s is None:
         return stated_s
-    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > SAME_WITHIN:
+    # 0.02: relative difference within which exposures of sheet and recording are the same (chosen)
+    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > 0.02:
         message = f"exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording"
         raise RecordingError(message, "correct the sheet", trial.name)
     return true_s
@@ -71,6 +72,7 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
 # by name: compressed frames, unknown depths and versions, interleaved colours.
 
 MARK_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 896, 1568  # Offsets in the settings of a cine, bytes from their beginning
+EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
 
 def inspect_cine(path: Path) -> Recording:
@@ -171,7 +173,7 @@ def _cine_clock(
     if len(stored_exposures) >= 4 * count:
         exposures_s = np.frombuffer(stored_exposures, "<u4", count) * fraction_s
         exposure_s = float(np.median(exposures_s)) or exposure_s
-        if np.ptp(exposures_s) > SAME_WITHIN * exposure_s:
+        if np.ptp(exposures_s) > EXPOSURE_TOLERANCE * exposure_s:
             span = f"{1e6 * exposures_s.min():.4g} to {1e6 * exposures_s.max():.4g} µs"
             notes.append(f"{name}: the exposure changes from frame to frame, {span}: switch automatic exposure off")
     stamps = blocks.get(1002, b"")
@@ -183,7 +185,7 @@ def _cine_clock(
         period_s = float(np.median(np.diff(times_s)))
         if period_s <= 0:
             times_s = None
-        elif rate <= 0 or abs(rate * period_s - 1) > SAME_WITHIN:
+        elif rate <= 0 or abs(rate * period_s - 1) > SAME_RATE:
             if rate > 0:
                 notes.append(f"{name}: set to {rate:g} frames a second, but its frames are {1 / period_s:.6g} a second")
             rate = 1 / period_s
@@ -247,7 +249,7 @@ def read_side_file(path: Path) -> tuple[Recording, str, str]:
     if step > 1:
         rate /= step
         notes.append(f"{name}: every {step:g}th frame was saved: {rate:g} frames a second of {rate * step:g}")
-    if not 0 < exposure_s * rate <= 1.0 + SAME_WITHIN:
+    if not 0 < exposure_s * rate <= 1.0 + EXPOSURE_TOLERANCE:
         exposure_s = 0.0
     width, height, bits, depth = (
         int(value(key)) for key in ("Image Width", "Image Height", "Color Bit", "EffectiveBit Depth")
