@@ -345,8 +345,8 @@ def test_the_event_lies_between_the_pictures_that_differ_from_either_end():
     for i in range(20, 60):
         pictures[i][20:30, : min(60, 4 * (i - 19))] = 170
     numbers = np.arange(60) * 50
-    # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_PART of that.
-    assert event_range(pictures, numbers, 3000) == (19 * 50 - 112, 34 * 50 + 112)
+    # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_FRAMES.
+    assert event_range(pictures, numbers, 3000) == (19 * 50 - 40, 34 * 50 + 40)
     assert event_range(pictures[:20], numbers[:20], 1000) is None
 
 

@@ -263,7 +263,7 @@ def column_after_leap(path: Floats) -> int:
 
 MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
 MAX_SAMPLE_INTERVAL = 120  # Maximum number of frames from one sample to the next (chosen)
-MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
+MARGIN_FRAMES = 40  # Frames added at either end of the event (chosen)
 
 
 def read_event(recording: Recording, frame_range: tuple[int, int] | None = None) -> Frames:
@@ -293,8 +293,7 @@ def event_range(pictures: list[NDArray[Any]], numbers: Indices, count: int) -> t
         return None
     time.sort()
     start, stop = int(numbers[time[fewest - 1] - 1]), int(numbers[time[-fewest]])
-    margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
-    return max(start - margin, 0), min(stop + margin, count - 1)
+    return max(start - MARGIN_FRAMES, 0), min(stop + MARGIN_FRAMES, count - 1)
 
 
 def _samples(recording: Recording, index: PacketIndex | None) -> tuple[list[NDArray[Any]], Indices]:

@@ -314,8 +314,8 @@ def _least_misfit(candidates: Floats, misfits: Floats) -> float:
 
 
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
-# Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
-LEAST_FITTED_AMPLITUDE = 0.5
+# Amplitude, contrast relative to that of other frames, below which too little of the edge is visible (chosen)
+LEAST_AMPLITUDE = 0.5
 
 
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cost: NDArray[np.float32]) -> Floats:
@@ -342,13 +342,13 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cos
             step = max(0.0 if math.isnan(gap) else abs(gap) for gap in (second - previous, third - second))
             reach = max(1.3 * step, step + 1.5)
             low, high = (previous - reach, previous + 0.8) if sense < 0 else (previous - 0.8, previous + reach)
-            inside, like_an_edge = low <= edge[t] <= high, abs(out[t, 3]) < 1 - LEAST_FITTED_AMPLITUDE
+            inside, like_an_edge = low <= edge[t] <= high, abs(out[t, 3]) < 1 - LEAST_AMPLITUDE
             fits = out[t, 2] <= bad_misfit and like_an_edge
             if not math.isfinite(previous) or (inside and fits):
                 continue
             places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))
             found = search_edges(strip, state, np.full(len(places), t), places)
-            seen = np.isfinite(found[:, 2]) & (found[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
+            seen = np.isfinite(found[:, 2]) & (found[:, 3] > LEAST_AMPLITUDE - 1)
             found = found[seen & (found[:, 0] >= low - 0.5) & (found[:, 0] <= high + 0.5)]
             if len(found):
                 replacement = found[np.argmin(found[:, 2])]
@@ -389,8 +389,6 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 # mouth stays: its border with the background looks like a tip at rest while the tip moves behind it. What the tip
 # leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
-
-LEAST_AMPLITUDE = 0.6  # Contrast, relative to that of other frames, below which too little is visible (chosen)
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6

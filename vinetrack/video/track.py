@@ -289,7 +289,7 @@ def too_few(frames: int) -> str:
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 
-REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
+REST_SIGMAS, REST_PX = 3.0, 0.25  # An edge is at rest while it stays this near to its level (chosen)
 
 
 @dataclass(frozen=True)
@@ -306,8 +306,7 @@ class PointQuality:
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     """First and last moving frame; (0, n − 1) if the edge never rests, (n, −1) if it never moves. At rest means: over
-    three frames or more, within three standard errors of the resting level (REST_PX at least; END_REST_PX at the end,
-    where a creeping stop must still show).
+    three frames or more, within three standard errors of the resting level, or REST_PX, so that a creeping stop shows.
     """
     good = np.flatnonzero(np.isfinite(edge_px))
     n = len(edge_px)
@@ -318,8 +317,8 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     # 2.0: least travel that counts as motion (chosen)
     if high - low < max(2 * REST_SIGMAS * noise, 2.0):
         return n, -1
-    first = _first_moving_point(y, max(REST_SIGMAS * noise, REST_PX))
-    tolerance = max(REST_SIGMAS * noise, END_REST_PX)
+    tolerance = max(REST_SIGMAS * noise, REST_PX)
+    first = _first_moving_point(y, tolerance)
     last = len(y) - 1 - _first_moving_point(-y[::-1], tolerance)
     steps = np.diff(y[-7:])
     # 5.0: ratio of the steps to the tolerance above which a fast edge that stands still in the last two frames stops,
