@@ -35,7 +35,7 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
 from vinetrack.inference.systematics import with_unknowns
 
-N_BY_VINE, ORDER_DRIFT, SPECIMEN = "n_by_vine", "order_drift", "specimen"
+ORDER_DRIFT, SPECIMEN = "order_drift", "specimen"
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
 # Hypotheses that trials differ, by their names in an answer set: what lists their forms, given this name, that the
 # trials of a fit, linearised at a solution, can test; standard deviations are chosen
 BETWEEN: dict[str, Callable[[str, Fit, Solution], Sequence[Difference]]] = {
-    N_BY_VINE: _of_vines,
+    "n_by_vine": _of_vines,
     ORDER_DRIFT: _of_order,
     SPECIMEN: partial(_of_specimens, B_sd=0.06, pressure_sd_Pa=300.0),
     "day": partial(of_column, B_sd=0.03, pressure_sd_Pa=300.0, gain_sd=0.03),

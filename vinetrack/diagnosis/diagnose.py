@@ -24,14 +24,13 @@ from vinetrack.diagnosis.ladder import ladder as error_ladder
 from vinetrack.diagnosis.likelihood_ratio import FAR_BEHIND, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.locate import locate
-from vinetrack.diagnosis.misfit_tests import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, LARGEST_MISSED, testable
+from vinetrack.diagnosis.misfit_tests import LARGEST_MISSED, testable
 from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN_TRIALS,
-    CONTAINS,
     DROPPED_FRAMES,
     NOT_TESTABLE,
     REFITTED,
@@ -48,6 +47,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import Limits
+from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
@@ -144,7 +144,7 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
     steps = select_effects(fit, effects, report)
     rounds = tuple(_to_round(step, not_testable) for step in steps)
     explanation = " ".join(finished.explanation for finished in rounds)
-    lacks = {name: why for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)}
+    lacks = {name: why for name, why in not_testable.items() if why.code in ("column_blank", "columns_partly_blank")}
     lack_columns = [name for name, why in lacks.items() if why.facts.get("column") != "payload_g"]  # blank: none
     not_tried = lack_columns if any(finished.verdict == UNEXPLAINED for finished in rounds) else []
     return Diagnosis(
@@ -212,7 +212,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     for effect in (effect for name, effect in effects.items() if name not in singles):
         z, is_adequate = tests.best_z(effect.name), step.verdict == ADEQUATE
         # An effect that contains one of the answer set can fit no worse, and need not be fitted.
-        reasons = [remark(CONTAINS, name=answer) for answer in effect.replaces if answer in step.answer_names]
+        reasons = [remark("contains", name=answer) for answer in effect.replaces if answer in step.answer_names]
         status, delta_chi2, sigma = SCREENED, z**2, z
         if effect.name in tests.products.silent:
             status, delta_chi2, sigma, reasons = NOT_TESTABLE, math.nan, math.nan, [remark("no_response")]
@@ -300,13 +300,12 @@ def _with_missing_force(result: Diagnosis) -> Diagnosis:
 # others leave nothing unexplained.
 
 CHANCE = 1e-3  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
-FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
 
 
 def odd_trials(fit: Fit) -> tuple[str, ...]:
     """Find trials whose force is off by far more than that of the others; else those that the model alone misses."""
     trials, data = [one.trial for one in fit.trials], fit.predictor.data
-    if len(trials) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
+    if len(trials) < FEWEST_CLUSTERS or any(trial.travel_ratio != 2 for trial in trials):
         return ()
     pressure_Pa = np.array([one.typical_pressure_Pa for one in data])
     over_Pa = pressure_Pa - [np.nan_to_num(trial.yield_pressure_Pa) for trial in trials]

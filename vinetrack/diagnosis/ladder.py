@@ -322,7 +322,6 @@ COMPARISON_COLUMNS = (
     *("model", "condition", "rms_position_m", "rms_final_velocity_m_s", "replicate_floor_m", "ratio", "worst_at_s"),
     *("worst_at_m", *EXPECTED),
 )
-FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
 
 @dataclass(frozen=True, repr=False)
@@ -362,7 +361,7 @@ def compare(
     pairs: Pairs,
     *,
     kinematics: Mapping[str, Kinematics] | None = None,
-    final_at_fraction: float = FINAL_AT_FRACTION,
+    final_at_fraction: float = 0.95,
 ) -> Comparison:
     """Compare a fitted model with trials."""
     aligned = align_trials(fit)

@@ -16,7 +16,6 @@ from scipy.special import hyperu, ndtri_exp
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.diagnosis.misfit_tests import is_plausible
-from vinetrack.diagnosis.result import CONTAINS_AND_FITS_NO_BETTER
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
@@ -210,7 +209,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             and other.deviance_excess(ratio) <= reach
         ]
         if simpler:
-            rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
+            rejected[ratio.label] = remark("contains_and_fits_no_better", name=simpler[0].names[-1])
         else:
             members.append(ratio)
     return members, rejected

@@ -53,12 +53,13 @@ from vinetrack.effects import Effect, EffectError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_data import FEWEST_POINTS, FitError, FitTrial
+from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE, Predictor
 from vinetrack.planning.candidate_trials import at_solution, extended_fit, tracks_of
+from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.tracks.position_noise import ar1_noise
 
 # ------------------------------------------------------------------------------
@@ -141,7 +142,7 @@ def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> 
 # ------------------------------------------------------------------------------
 # Detectable sizes: the distribution of every score at a size, against the threshold of its candidate.
 
-DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
+DRAWS = 4000  # Draws of the normal distributions (derived)
 
 # Scores at the true standard deviations for which the inflation is tabulated (chosen)
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
@@ -157,7 +158,7 @@ def power_of(
     # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
     start = noiseless_start(tests.fit) if tests.fit.solution.noise_held else None
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
-    normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
+    normal = np.random.default_rng(5).standard_normal((DRAWS, len(tests.signs)))
     known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests)
     asked = [effect for effect in tests.effects if only in ("", effect.name)]
     powers = [_effect_power(tests, effect, start, *known) for effect in asked]
@@ -277,7 +278,7 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
     limit = tests.family[tests.products.effects[index]]
     passes = SCORE_GRID / inflation >= limit
     threshold = float(SCORE_GRID[np.argmax(passes)]) if passes.any() else math.inf
-    draw = np.random.default_rng(SEED)
+    draw = np.random.default_rng(5)
     by_trial = np.maximum(scores.trial_informations[:, index], 0.0)
     trials, total = by_trial.size, float(by_trial.sum())
     if trials < FEWEST_CLUSTERS or not total > 0:

@@ -120,9 +120,6 @@ FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called sig
 FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)
 LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
 
-# Conditions on which a parameter should not depend, as fields of a trial
-COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
-
 DRIFT_COLUMNS = (
     *("parameter", "vine", "symbol", "against", "from_level", "to_level", "change", "change_sigma", "z"),
     *("significant", "sentence"),
@@ -152,7 +149,8 @@ def drift(fit: Fit, aligned: AlignedTrials | None = None) -> Drift:
     if DAMPING in fit.predictor.layout.keys:
         of_trials = per_trial_estimates(fit, aligned or align_trials(fit))
         damping = next(number for number in fit.numbers if number.key == DAMPING)
-        tests = [*(test for against in COVARIATES for test in _against(of_trials, damping, against)), *tests]
+        covariates = [COLUMNS[name].field for name in (*LIMITED["range"], *RIG)]
+        tests = [*(test for against in covariates for test in _against(of_trials, damping, against)), *tests]
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     table = pd.DataFrame(tests, columns=[*DRIFT_COLUMNS, "p", "groups"]).sort_values(
         "p", kind="stable", ignore_index=True

@@ -43,7 +43,7 @@ from vinetrack.inference.marginal_likelihood import (
     summed,
     trial_effect_prior,
 )
-from vinetrack.inference.optimiser import relative_residuals, track_correlation
+from vinetrack.inference.optimiser import POOR_FIT, relative_residuals, track_correlation
 from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import rounding_noise
@@ -57,8 +57,6 @@ REACH_SIGMAS = 2.0  # Standard errors by which a size may lie beyond a plausible
 
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
-
-COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
 
 
 @dataclass(frozen=True)
@@ -105,11 +103,11 @@ def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
     if "trace_time" in effect.functions and not any(has_trace):
         return remark("no_measured_pressure")
     if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
-        return remark(COLUMN_BLANK, column=absent[0])
+        return remark("column_blank", column=absent[0])
     try:
         check_needs(Model((effect,)), *trials)
     except EffectError:
-        return remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
+        return remark("columns_partly_blank", columns=list(effect.needs))
     return Remark()
 
 
@@ -588,9 +586,6 @@ FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
 
 PROBE_LEVEL = 3e-4  # Largest level of the test of all probes (chosen)
 
-# χ² per degree of freedom, against the noise of the tracks alone, from which a model is far off (chosen)
-FAR_OFF_CHI2_PER_DOF = 4.0
-
 # Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any tracker
 MISSED_FRACTION = 6e-4
 
@@ -614,7 +609,7 @@ def exceeds_slow_errors(fit: Fit) -> bool:
     _, places = np.unique([trial_data.trial.condition for trial_data in data], return_inverse=True)
     shared = max((np.min(missed[places == k]) for k in np.flatnonzero(np.bincount(places) > 1)), default=0.0)
     beyond = max(np.median(missed), shared) > max(MISSED_FRACTION, systematic) or np.max(missed) > LARGEST_MISSED
-    return bool(fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and beyond)
+    return bool(fit.chi2_per_dof > POOR_FIT and beyond)
 
 
 @dataclass(frozen=True)

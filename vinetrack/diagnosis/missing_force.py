@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -56,8 +56,8 @@ VARIABLES = {
 
 # What a force may be where growth begins. A force that is free there competes with B, n and P_y, and has to be worth a
 # Δχ² of the answer set: those are believed first.
-ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
-LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
+Start = Literal["nothing", "a constant", "anything"]
+LOG_ODDS: dict[Start, float] = {"nothing": 0.0, "a constant": 0.0, "anything": -0.5 * ANSWER_SET_DELTA_CHI2}
 
 
 # Splines along a variable, when it is alone and when it is one of two (chosen)
@@ -127,20 +127,21 @@ class Domain:
         return self.basis(self.values_along(motion))
 
     @property
-    def hypotheses(self) -> list[tuple[str, tuple[float, ...]]]:
+    def hypotheses(self) -> list[tuple[Start, tuple[float, ...]]]:
         """What the force may be where growth begins, with every combination of length scales."""
-        starts = list(LOG_ODDS) if len(self.axes) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
-        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.axes))
-        return list(itertools.product(starts if self.start_axis >= 0 else [FREE_AT_START], lengths))
+        starts: list[Start] = list(LOG_ODDS) if len(self.axes) == 2 else ["nothing", "a constant"]
+        if self.start_axis < 0:
+            starts = ["anything"]
+        return list(itertools.product(starts, itertools.product(LENGTH_SCALES, repeat=len(self.axes))))
 
-    def modes(self, at_start: str, lengths: Sequence[float]) -> Floats:
+    def modes(self, at_start: Start, lengths: Sequence[float]) -> Floats:
         """Square root of the covariance of the coefficients at unit amplitude, shape (n_splines, n_modes)."""
         start = self.start_axis
         roots = [root_of_covariance(*each, k == start) for k, each in enumerate(zip(self.counts, lengths, strict=True))]
         modes = [product_of_modes(roots)]
-        if at_start == CONSTANT_AT_START:
+        if at_start == "a constant":
             modes.append(np.ones((math.prod(self.counts), 1)))
-        if at_start == FREE_AT_START and start >= 0:
+        if at_start == "anything" and start >= 0:
             # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest (chosen)
             roots[start] = np.full((self.counts[start], 1), 3.0)
             modes.append(product_of_modes(roots))

@@ -31,7 +31,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SEARCH_SIGMAS, misfit_tests
 from vinetrack.diagnosis.missing_force import (
     LEAST_MISFIT_REDUCTION,
     QUANTITIES,
@@ -191,8 +191,6 @@ def _table_code(domain: Domain) -> list[str]:
 # ------------------------------------------------------------------------------
 # Laws, and where no formula reproduces it the learned force, fitted as effects.
 
-LEAST_SIGMAS = 6.0  # Standard deviations by which a force must improve the fit to be proposed
-
 
 @dataclass(frozen=True)
 class Proposed:
@@ -295,7 +293,7 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
     """Whether a force is significant, and takes away a good part of a misfit that exceeds the noise."""
     misfit = before.chi2_per_dof - 1
     reduction = before.chi2_per_dof - ratio.fit.chi2_per_dof
-    return ratio.sigma > LEAST_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
+    return ratio.sigma > SEARCH_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
 
 
 # ------------------------------------------------------------------------------

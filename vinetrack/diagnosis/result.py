@@ -258,9 +258,6 @@ MAX_STRETCHES = 8  # Most stretches of the growth over which a diagnosis and its
 
 BETWEEN_TRIALS = "between_trials"  # Kind of a hypothesis that trials differ
 
-# Codes of reasons of a richer form: a candidate that equals another in a limit, named `name`
-CONTAINS, CONTAINS_AND_FITS_NO_BETTER = "contains", "contains_and_fits_no_better"
-
 
 @dataclass(frozen=True)
 class Candidate(JsonRecord):

@@ -347,8 +347,6 @@ def with_curves(fit: Fit) -> Fit:
 # ------------------------------------------------------------------------------
 # Which hypotheses leave an adequate model: the misfit tests are repeated with each member of the answer set added.
 
-MISFIT_REMAINS = remark("misfit_remains")
-
 
 def adequate_hypotheses(
     hypotheses: Sequence[LikelihoodRatio], search: Search
@@ -380,7 +378,7 @@ def adequate_hypotheses(
         tests = search.tests_after(hypothesis.fit)
         hypothesis = replace(hypothesis, fit=tests.fit)
         if tests.rejects_model:
-            rejected[hypothesis.label] = MISFIT_REMAINS
+            rejected[hypothesis.label] = remark("misfit_remains")
         elif len(hypothesis.effects) > 1 and (reason := search.superfluous(hypothesis)):
             rejected[hypothesis.label] = reason
         else:
@@ -580,7 +578,7 @@ def _effect_set_rounds(search: Search, alone: Sequence[LikelihoodRatio]) -> list
         best_so_far = of_this_size[0]
     # Of the best hypothesis of each size, why it is no explanation
     reasons = {
-        best.label: rejected.get(best.label, MISFIT_REMAINS) if best.credible else best.reason
+        best.label: rejected.get(best.label, remark("misfit_remains")) if best.credible else best.reason
         for best in (*search.of_size(1)[:1], *search.of_size(2)[:1], best_so_far)
     }
     fitted, steps = tuple(search.fitted.values()), search.partial_steps()

@@ -17,6 +17,7 @@ from vinetrack.core.problems import InputError, UserError, reasons_told
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, with_flag
 from vinetrack.core.units import pressure_text
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
+from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.tracks.position_noise import (
     FOURTH_DIFFERENCE,
     Smoothing,
@@ -31,10 +32,6 @@ from vinetrack.tracks.position_noise import (
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
-
-
-FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
-
 
 LENGTH_ERROR = 0.005  # Standard deviation of a vine's length, relative (chosen)
 

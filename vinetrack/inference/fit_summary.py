@@ -37,10 +37,6 @@ from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 # cent. It is not part of the stated errors, because it can be weighed and is then negligible. In a campaign of two
 # dozen precise trials it may exceed all stated errors, and the fit then says so.
 
-FILM = "film_mass"  # The effect that makes the mass of the film a free parameter
-
-MATTERS = 1.0  # Change of a number, in its stated errors, from which the film is mentioned (derived)
-
 
 def film_influence(fit: Fit) -> Floats:
     """Standard deviation of each fitted number due to an unknown film mass, independent by 2 % for each vine.
@@ -61,7 +57,7 @@ def film_influence(fit: Fit) -> Floats:
     >>> vt.film_influence(fit).shape
     (3,)
     """
-    if FILM in fit.model:
+    if "film_mass" in fit.model:
         return np.zeros(len(fit.numbers))
     errors = systematics_of(fit.predictor, fit.solution, ["film"])
     solution = with_systematics(fit.predictor, fit.solution).solution
@@ -80,7 +76,7 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...
     """
     sigma = np.array([number.sigma for number in numbers])
     ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
-    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= MATTERS]
+    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= 1]
     shown = [(numbers[k], moved[k], *numbers[k].shown) for k in affected]
     changes = [(number.title, factor * size, unit) for number, size, unit, factor in shown]
     return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
