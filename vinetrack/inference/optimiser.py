@@ -129,7 +129,7 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
 # How well a solution describes the tracks: χ² per degree of freedom, relative residual, and what counts as poor.
 
 # χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried (chosen)
-POOR_FIT = 3.0
+POOR_FIT = 4.0
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
