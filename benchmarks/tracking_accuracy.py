@@ -3,8 +3,8 @@
     python benchmarks/tracking_accuracy.py [--set demo|hard|plain|bent|all] [--seeds score|tune] [--keep DIR]
 
 Sets: `demo` like the shipped demonstration, `hard` one recording of each harder preset of the virtual laboratory at a
-camera's bit rate, `plain` drawn by other code (tests/helpers/plain_scene.py), `bent` tubes that grow along curves
-(tests/helpers/bent_scene.py): along a curve drawn by a hand that is 3 px off, along the curve that is found, and along
+camera's bit rate, `plain` drawn by other code (tests/helpers/plain_scene.py), `bent` tubes that grow along curves,
+drawn by the same: along a curve drawn by a hand that is 3 px off, along the curve that is found, and along
 the straight axis that was found before curves were, on the same clips. Its truth is the arc length of the tip, its bias
 the distance of the tip's place along the tracked axis; constants of curves were tuned on seeds 1-4 of it, its tables
 are of seeds 601 and up. Constants of the tracker were tuned on
@@ -268,13 +268,12 @@ def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
 def bent_rows(seeds: list[int], folder: Path) -> dict[str, list[Row]]:
     """Tubes that grow along curves, H.264 at a camera's rate: by a drawn axis, a found one, and a straight one."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
-    from bent_scene import BENDS, BentPlan, bent_scene
-    from plain_scene import write_video
+    from plain_scene import BENDS, BENT, plain_scene, write_video
 
     rows: dict[str, list[Row]] = {"curve drawn": [], "curve found": [], "straight axis found": []}
     for name, changes in BENDS.items():
         for seed in seeds:
-            scene = bent_scene(BentPlan(seed=seed, **changes))
+            scene = plain_scene(replace(BENT, seed=seed, **changes))
             path = write_video(folder / f"bent_{name}_{seed}.mp4", scene.frames, bit_rate=15_000_000)
             hand = scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, 6))
             drawn = axis_through(hand + np.random.default_rng([seed, 5]).normal(0, 3.0, hand.shape))

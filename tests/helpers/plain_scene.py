@@ -1,15 +1,17 @@
 """Recordings with a known leading edge, drawn by code that shares nothing with the package: a truth of another hand.
 
-`plain_scene` draws frames in memory, `write_video` and `write_images` put them in files.
+`plain_scene` draws frames in memory, of a tube that grows straight on or along a curve; `write_video` and
+`write_images` put them in files.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,73 @@ class Plan:
     payload: bool = False
     mouth: float = 0.0  # How far beyond the resting tip a launcher covers the tube
     mouth_grey: float = 20.0
+    pieces: tuple[tuple[float, float], ...] = ()
+    """A curve: (length, turn in degrees, positive from x towards y) one behind the other from `from_px`, where the tube
+    points to `angle_deg`; straight where the turn is 0, else an arc of a circle."""
+
+
+BENT = Plan(
+    width=640, height=640, from_px=(40.0, 80.0), rest_frames=10, speed=14.0, exposure=0.3, radius=20.0, tip_depth=8.0,
+    film=165.0, tail_sd=8.0, noise=2.5,
+)  # fmt: skip
+BENDS: dict[str, dict] = {
+    "quarter": {"pieces": ((120.0, 0.0), (471.2, 90.0), (90.0, 0.0))},
+    "s_shape": {"pieces": ((80.0, 0.0), (260.0, 60.0), (260.0, -60.0), (80.0, 0.0)), "from_px": (30.0, 120.0)},
+    "gentle": {"pieces": ((80.0, 0.0), (480.0, 25.0)), "from_px": (30.0, 200.0)},
+    "kink": {"pieces": ((260.0, 0.0), (110.0, 70.0), (240.0, 0.0)), "from_px": (40.0, 120.0)},
+}
+"""Curves by name: a quarter circle of 300 px radius, an S of 248 px, a gentle bend of 1100 px, a sharp one of 90 px."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Frames, shape (n, height, width), uint8, and the true edge at mid-exposure, shape (n,), px from `from_px`."""
+    """Frames, shape (n, height, width), uint8, and the true edge at mid-exposure, shape (n,), px from `from_px`; of one
+    along a curve its places (x, y), and their arc length, px, along which the edge counts.
+    """
 
     plan: Plan
     frames: np.ndarray
     edge_px: np.ndarray
     moving: np.ndarray
+    curve_px: np.ndarray
+    arc_px: np.ndarray
+
+    def places(self, along_px: np.ndarray) -> np.ndarray:
+        """Places (x, y) of the curve, shape (n, 2), px."""
+        return np.stack([np.interp(along_px, self.arc_px, self.curve_px[:, k]) for k in (0, 1)], axis=1)
+
+
+def curve_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Places (x, y) of the curve and their arc length, every 1/20 px along the plan's pieces, px."""
+    x, y, angle, done = *plan.from_px, np.radians(plan.angle_deg), 0.0
+    pieces, arcs = [np.empty((0, 2))], [np.empty(0)]
+    for length, turn in plan.pieces:
+        s = np.arange(0, length, 0.05)
+        bend = np.radians(turn) / length
+        if bend:
+            turned = angle + bend * np.append(s, length)
+            way = np.stack([np.sin(turned) - np.sin(angle), np.cos(angle) - np.cos(turned)], axis=1) / bend
+        else:
+            way = np.outer(np.append(s, length), [np.cos(angle), np.sin(angle)])
+        way += (x, y)
+        pieces.append(way[:-1])
+        arcs.append(s + done)
+        x, y, angle, done = *way[-1], angle + bend * length, done + length
+    return np.concatenate(pieces), np.concatenate(arcs)
+
+
+def beside_curve(curve: np.ndarray, arc: np.ndarray, xx: np.ndarray, yy: np.ndarray, reach: float):
+    """Of every pixel its place along and across the curve by the nearest of its places; far off beyond `reach` px."""
+    along, across = np.full(xx.shape, 1e6), np.full(xx.shape, 1e6)
+    pixels = np.column_stack([xx.ravel(), yy.ravel()])
+    away, nearest = cKDTree(curve).query(pixels, distance_upper_bound=reach)
+    near = np.flatnonzero(np.isfinite(away))
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    offset, unit = pixels[near] - curve[nearest[near]], tangent[nearest[near]]
+    along.flat[near] = arc[nearest[near]] + np.sum(offset * unit, axis=1)
+    across.flat[near] = unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
+    return along, across
 
 
 def texture(rng: np.random.Generator, shape: tuple[int, int], scale: float, sd: float) -> np.ndarray:
@@ -94,15 +153,19 @@ def developed(plan: Plan, picture: np.ndarray, frame: int, phase, rng, light=1.0
 
 def plain_scene(plan: Plan) -> Scene:
     """Draw the plan."""
-    rng = np.random.default_rng(plan.seed)
+    rng, (curve, arc) = np.random.default_rng(plan.seed), curve_of(plan)
+    plan = replace(plan, end_px=float(arc[-1]) - 20.0) if plan.pieces else plan
     long_time = np.arange(100_000)
     reached = int(np.argmax(travel(plan, long_time.astype(float)) >= plan.end_px))
     n_frames = (reached if travel(plan, long_time[-1:])[0] >= plan.end_px else 400) + plan.end_frames
     h, w = plan.height, plan.width
     yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
-    angle = np.radians(plan.angle_deg)
-    along = (xx - plan.from_px[0]) * np.cos(angle) + (yy - plan.from_px[1]) * np.sin(angle)
-    across = -(xx - plan.from_px[0]) * np.sin(angle) + (yy - plan.from_px[1]) * np.cos(angle)
+    if plan.pieces:
+        along, across = beside_curve(curve, arc, xx, yy, plan.radius + 8)
+    else:
+        angle = np.radians(plan.angle_deg)
+        along = (xx - plan.from_px[0]) * np.cos(angle) + (yy - plan.from_px[1]) * np.sin(angle)
+        across = -(xx - plan.from_px[0]) * np.sin(angle) + (yy - plan.from_px[1]) * np.cos(angle)
     back = plan.background + plan.gradient * (along / w) + texture(rng, (h, w), 2.0, plan.background_sd)
     ticks = (np.mod(along, 27.5) < 2.0) & (np.abs(across - plan.radius - 16) < 6)
     back = np.where(ticks, back - 40, back)
@@ -144,7 +207,7 @@ def plain_scene(plan: Plan) -> Scene:
             ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
             picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)
         frames[i] = developed(plan, picture, i, phase[1:], rng, light=1 + plan.flicker * np.sin(0.9 * i + phase[3]))
-    return Scene(plan, frames, edge, moving(plan, n_frames))
+    return Scene(plan, frames, edge, moving(plan, n_frames), curve, arc)
 
 
 def write_video(

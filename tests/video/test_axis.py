@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pictures
 import pytest
-from bent_scene import BENDS, BentPlan, BentScene, bent_scene
 from pictures import in_memory, tracked
-from plain_scene import Plan, plain_scene, write_images
+from plain_scene import BENDS, BENT, Plan, Scene, plain_scene, write_images
 
 from vinetrack.core.records import Trial
 from vinetrack.video import axis as curves
@@ -295,7 +294,7 @@ def test_rings_about_the_circles_middle_become_level_lines():
     assert strip.axis == quarter()
 
 
-def drawn(scene: BentScene) -> Axis:
+def drawn(scene: Scene) -> Axis:
     """An axis as a hand draws it: six points, each off by a few pixels."""
     places = scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, 6))
     return axis_through(places + np.random.default_rng(scene.plan.seed).normal(0, 3.0, places.shape))
@@ -303,7 +302,7 @@ def drawn(scene: BentScene) -> Axis:
 
 @pytest.mark.slow
 def test_metres_are_lengths_along_the_curve_in_the_tilted_plane():
-    bent = bent_scene(BentPlan(seed=3, speed=22.0, **BENDS["quarter"]))
+    bent = plain_scene(replace(BENT, seed=3, speed=22.0, **BENDS["quarter"]))
     parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
     plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
@@ -329,8 +328,8 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane():
 
 @pytest.mark.slow
 def test_camera_shake_is_removed_along_a_curve():
-    short = {"pieces": ((120.0, 0.0), (345.0, 66.0)), "from_px": (40.0, 90.0)}
-    shaken = bent_scene(BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **short))
+    short = {"pieces": ((120.0, 0.0), (345.0, 66.0)), "from_px": (40.0, 90.0), "width": 560, "height": 480}
+    shaken = plain_scene(replace(BENT, seed=2, speed=22.0, shake=1.2, **short))
     tracking = tracked(shaken.frames, shaken.plan.exposure, drawn(shaken))
     used = shaken.moving & tracking.track.usable
     error = tracking.track.edge_px[used] - shaken.edge_px[used]
@@ -344,7 +343,7 @@ def test_camera_shake_is_removed_along_a_curve():
 @pytest.mark.parametrize(("name", "is_drawn"), [("quarter", True), ("quarter", False), ("gentle", False)])
 def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(name, is_drawn):
     sd_px, off_px = (0.35, 2.0) if is_drawn else (0.4, 2.5)
-    scene = bent_scene(BentPlan(seed=3 if is_drawn else 4, speed=22.0, **BENDS[name]))
+    scene = plain_scene(replace(BENT, seed=3 if is_drawn else 4, speed=22.0, **BENDS[name]))
     tracking = tracked(scene.frames, scene.plan.exposure, drawn(scene) if is_drawn else None)
     assert tracking.axis.bends
     track, used = tracking.track, scene.moving & tracking.track.usable
