@@ -28,10 +28,33 @@ SIZE = "size_reservoir_depletion.gamma"
 
 
 def redraws_ms(visitor: Visitor, moves: int) -> list[float]:
-    """Time from each move of the slider to the frame that shows it."""
-    visitor.time_redraws(SIZE)
-    visitor.drag(SIZE, [-0.6 * (0.5 - 0.5 * np.cos(0.4 * k)) for k in range(1, moves + 1)], visitor.one_redraw)
-    return visitor.redraws_ms()
+    """Time from each move of the slider to the frame that shows it: from its first change to the frame painted."""
+    visitor.chrome.run(
+        f"""(() => {{
+          window.redraws_ms = [];
+          let moved = 0;
+          {visitor.model(SIZE)}.properties.value.change.connect(() => {{ moved ||= performance.now(); }});
+          {visitor.model("model_curves")}.properties.data.change.connect(() => {{
+            const begun = moved;
+            moved = 0;
+            if (begun) requestAnimationFrame(() => setTimeout(() => redraws_ms.push(performance.now() - begun)));
+          }});
+        }})()"""
+    )
+
+    def one_redraw() -> None:
+        """Wait, within the page, until one more redraw was recorded; for two seconds at most."""
+        visitor.chrome.run(
+            """(async () => {
+              const count = window.redraws_seen ?? 0;
+              const end = performance.now() + 2000;
+              while (redraws_ms.length <= count && performance.now() < end) await new Promise((r) => setTimeout(r, 2));
+              window.redraws_seen = redraws_ms.length;
+            })()"""
+        )
+
+    visitor.drag(SIZE, [-0.6 * (0.5 - 0.5 * np.cos(0.4 * k)) for k in range(1, moves + 1)], one_redraw)
+    return list(visitor.chrome.run("redraws_ms"))
 
 
 def computed_ms(results: Path) -> tuple[int, float]:

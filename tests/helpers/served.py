@@ -131,34 +131,3 @@ class Visitor:
             self.chrome.mouse("move", x + part * whole, y, held=True)
             after()
         self.chrome.mouse("release", x + path[-1] * whole, y)
-
-    def time_redraws(self, slider: str) -> None:
-        """Start recording, for every redraw, the time from its first slider move to the frame that shows it."""
-        self.chrome.run(
-            f"""(() => {{
-              window.redraws_ms = [];
-              let moved = 0;
-              {self.model(slider)}.properties.value.change.connect(() => {{ moved ||= performance.now(); }});
-              {self.model("model_curves")}.properties.data.change.connect(() => {{
-                const begun = moved;
-                moved = 0;
-                if (begun) requestAnimationFrame(() => setTimeout(() => redraws_ms.push(performance.now() - begun)));
-              }});
-            }})()"""
-        )
-
-    def redraws_ms(self) -> list[float]:
-        """The recorded times."""
-        found: list[float] = self.chrome.run("redraws_ms")
-        return found
-
-    def one_redraw(self) -> None:
-        """Wait, within the page, until one more redraw was recorded; for two seconds at most."""
-        self.chrome.run(
-            """(async () => {
-              const count = window.redraws_seen ?? 0;
-              const end = performance.now() + 2000;
-              while (redraws_ms.length <= count && performance.now() < end) await new Promise((r) => setTimeout(r, 2));
-              window.redraws_seen = redraws_ms.length;
-            })()"""
-        )
