@@ -10,13 +10,12 @@ import grown as campaigns
 import numpy as np
 import pandas as pd
 import pytest
-from grown import Pairs
+from grown import Pairs, hidden, tubes
 from hidden import make, shots
 from hidden.balls import fallen
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
-from hidden_truth import grown, sheet
-from lsoda_vine import as_track, small_campaign
+from lsoda_vine import as_track
 from own_effect import NAME, write_effect
 
 import vinetrack as vt
@@ -26,7 +25,7 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
 from vinetrack.diagnosis.diagnose import with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
-from vinetrack.diagnosis.ladder import align_trials, not_better, with_host
+from vinetrack.diagnosis.ladder import align_trials, not_better
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
@@ -38,7 +37,6 @@ from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import relative_residuals, variance_floor
 from vinetrack.laboratory.campaigns import Vine
 from vinetrack.laboratory.campaigns import campaign as laboratory_campaign
-from vinetrack.tracks.importers import flag_end_of_motion
 
 
 def diagnosed(pairs, candidates=None) -> result.Diagnosis:
@@ -175,37 +173,13 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day_and_known_to
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effect", "of_time", "of_length"), [("length_scale", 1.0, 1.03), ("time_base", 1.02, 1.0)])
-def test_a_scale_or_a_rate_that_is_off_for_the_recordings_of_one_vine_is_named_with_it(
-    tmp_path, effect, of_time, of_length
-):
-    """The sheet states no days. A rate 2 % off was `missing: reel_inertia`, a scale 3 % off `unexplained`."""
-    known = campaign("clean", 90001, (24, 24), weighed=False)
-    last = known.recordings[-1].cells["length_mm"]
-    recordings = [
-        replace(one, time_s=of_time * one.time_s, position_m=of_length * one.position_m)
-        if one.cells["length_mm"] == last
-        else one
-        for one in known.recordings
-    ]
-    write_experiment(replace(known, recordings=tuple(recordings)), tmp_path / "e")
-    said = diagnosed(vt.read_experiment(tmp_path / "e"))
-    assert (said.verdict, said.answer_set) == ("artefact", (effect,))
-    sizes = {f"{last:g}mm" in number.vine: number for number in row_of(said, effect).numbers}
-    assert abs(sizes[False].value) < 3 * sizes[False].sigma
-    assert abs(sizes[True].value - (of_time * of_length - 1)) < 3 * sizes[True].sigma < 0.015
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("row", "seed"), [("chamber_larger", 914), ("chamber_smaller", 902)])
-def test_a_chamber_that_was_misread_is_a_depletion(tmp_path, row, seed):
+def test_a_chamber_that_was_misread_is_a_depletion(tmp_path):
     """With a γ that no gas has, and nothing else."""
     rivals = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
-    said = diagnosed(laboratory(tmp_path, row, seed, (10, 14), weighed=False)[1], rivals)
-    assert said.effects == ("reservoir_depletion",)
-    assert said.final_verdict == "adequate"
+    said = diagnosed(laboratory(tmp_path, "chamber_smaller", 902, (10, 14), weighed=False)[1], rivals)
+    assert (said.effects, said.final_verdict) == (("reservoir_depletion",), "adequate")
     (gamma,) = [number for number in said.parameters if number.key == "reservoir_depletion.gamma"]
-    assert gamma.value < 1.0 if row == "chamber_larger" else gamma.value > 1.4
+    assert gamma.value > 1.4
 
 
 @pytest.mark.slow
@@ -310,7 +284,7 @@ FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", 
 
 @pytest.fixture(scope="module")
 def depleted_pairs():
-    return grown({"reservoir_depletion.gamma": 1.25}, seed=7100)
+    return hidden({"reservoir_depletion.gamma": 1.25}, seed=7100)
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +293,7 @@ def depleted(depleted_pairs):
 
 
 def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said():
-    nothing_missing = diagnosed(grown(seed=7000))
+    nothing_missing = diagnosed(hidden(seed=7000))
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
     ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}
@@ -329,22 +303,6 @@ def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_s
     assert blind["inlet_loss"].facts["column"] == "inlet_mm"
     assert blind["payload_drag"].facts["column"] == "payload_g"
     assert "static_yield" in blind
-
-
-@pytest.mark.slow
-def test_a_size_well_beyond_what_could_hide_would_have_been_seen():
-    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
-
-    def asked(**hidden: float) -> Diagnosis:
-        values = {f"tail_friction.{name}": size for name, size in hidden.items()}
-        pairs = grown(values, seed=7000, trials=sheet()[::2])
-        known = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
-        return vt.diagnose(known, candidates=FEW, ladder=False, advice=False)
-
-    largest = next(one.largest for one in asked().rounds[0].ranking if one.effect == "tail_friction")
-    found = asked(mu_w=4 * largest["tail_friction.mu_w"])
-    assert found.verdict in ("missing", "ambiguous")
-    assert "tail_friction" in found.answer_set
 
 
 def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
@@ -359,6 +317,8 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     assert list(depleted.ladder["added"]) == ["", "reservoir_depletion"]
     first, last = (depleted.ladder.iloc[k] for k in range(2))
     assert last["rms_left_out_m"] < 0.5 * first["rms_left_out_m"]
+    # Laid on the last model: far off, the first one would make replicates differ by more than they do.
+    assert first["floor_m"] == last["floor_m"] == align_trials(depleted.fits[1]).floor_m
     assert last["rms_in_sample_m"] < 2 * last["floor_m"]
 
 
@@ -379,7 +339,7 @@ def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted):
 
 @pytest.mark.slow
 def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do():
-    found = vt.diagnose(grown({"length_scale.eps": 0.06}, seed=7002, trials=sheet(35.6)[::2]), ladder=False)
+    found = vt.diagnose(hidden({"length_scale.eps": 0.06}, seed=7002, trials=tubes(35.6)[::2]), ladder=False)
     assert found.verdict == "artefact"
     assert "length_scale" in found.answer_set
     assert found.effects == ()
@@ -412,7 +372,7 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted):
 def test_a_users_own_effect_is_found_like_any_other(tmp_path):
     own = own_effects([write_effect(tmp_path)])
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "longest_frames": 420}
-    virtual = campaigns.grown(sheet()[::2], 7003, own=[tmp_path / f"{NAME}.py"], values={f"{NAME}.k": 1.5}, **scatter)
+    virtual = campaigns.grown(tubes()[::2], 7003, own=[tmp_path / f"{NAME}.py"], values={f"{NAME}.k": 1.5}, **scatter)
     pairs = campaigns.pairs_of(virtual)
     found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, NAME), ladder=False, advice=False)
     assert found.verdict == "missing"
@@ -421,39 +381,11 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path):
     assert abs(size.value - 1.5) < 4 * size.sigma
 
 
-@pytest.mark.slow
-def test_a_measured_pressure_already_holds_what_happens_in_the_chamber():
-    steady = [(t, replace(x, pressure_Pa=np.full(x.time_s.size, t.pressure_Pa))) for t, x in grown(seed=7005)]
-    found = vt.diagnose(steady, ladder=False, advice=False)
-    blind = {one.effect: one.reason for one in found.rounds[0].ranking if one.status == NOT_TESTABLE}
-    assert blind["reservoir_depletion"].code == "in_measured_pressure"
-
-
-@pytest.fixture(scope="module")
-def plain():
-    return vt.fit(vt.base_model(), grown(seed=51))
-
-
 def test_an_effect_that_predicts_no_condition_better_is_said_to():
     table = pd.DataFrame({"added": ["", "latch_release"], "rms_left_out_m": [4.09, 4.09]})
     told = not_better(table.assign(rms_highest_pressure_m=[3.88, 4.16]))
     assert [(one.code, one.facts["highest"]) for one in told] == [("left_out_error_does_not_fall", k) for k in (0, 1)]
     assert not_better(table.assign(rms_left_out_m=[4.09, 3.2], rms_highest_pressure_m=np.nan)) == []
-
-
-@pytest.mark.slow
-def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain):
-    of_fit = {name: getattr(plain.predictor, name) for name in ("steps", "pressure_step")}
-    kept = {name: array.copy() for name, array in of_fit.items()}
-    theta = plain.solution.state.theta.copy()
-    diagnosis = vt.diagnose(plain, candidates=["leak", "air_drag"], ladder=False, advice=False)
-    for name, array in of_fit.items():
-        assert not np.shares_memory(getattr(diagnosis.fits[0].predictor, name), array)
-        np.testing.assert_array_equal(array, kept[name])
-    np.testing.assert_array_equal(plain.solution.state.theta, theta)
-    # Otherwise fits without a condition, which end early, miss by more or less after a run than after `diagnose`.
-    assert plain.predictor.is_central
-    assert with_host(plain, None).predictor.is_central
 
 
 DRAG = 0.5
@@ -484,19 +416,6 @@ def test_the_drag_of_falling_balls_is_named(model):
     assert align_trials(found.fits[0]).scatter.multiple == 1.0  # no pressure or B of theirs can scatter
     untried = {row.effect for row in found.rounds[0].ranking if row.status == "not testable here"}
     assert untried >= TUBES_ALONE
-
-
-@pytest.mark.slow
-def test_vines_that_a_wall_stops_half_way_lack_nothing():
-    draw, stopped = np.random.default_rng(1), []
-    for trial, track in small_campaign(3)[0]:
-        wall_m = track.lead_position_m[0] + 0.8 * np.ptp(track.lead_position_m)
-        moving = int(np.argmax(track.lead_position_m > wall_m))
-        time_s = np.concatenate([track.time_s[:moving], track.time_s[moving] + np.arange(15) / 1069])
-        stands_m = wall_m + draw.normal(0, np.std(track.lead_position_m[:5]), 15)
-        ended = plain_track(time_s, np.concatenate([track.lead_position_m[:moving], stands_m]))
-        stopped.append((trial, flag_end_of_motion(trial, ended)))
-    assert vt.diagnose(stopped, ladder=False, advice=False).verdict == "adequate"
 
 
 @pytest.mark.slow

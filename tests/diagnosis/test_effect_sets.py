@@ -5,7 +5,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from hidden_truth import grown, sheet
+from grown import hidden, tubes
 from scipy.stats import chi2, norm
 
 import vinetrack as vt
@@ -148,7 +148,7 @@ LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 
 def asked(*names: str, **how: bool) -> result.Diagnosis:
-    return vt.diagnose(grown(TRUTH | LATCH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
+    return vt.diagnose(hidden(TRUTH | LATCH, seed=7200, trials=tubes()[::2]), candidates=names, **how)
 
 
 @pytest.fixture(scope="module")

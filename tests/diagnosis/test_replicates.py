@@ -10,7 +10,7 @@ import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis import diagnose as diagnosing
 from vinetrack.diagnosis.diagnose import diagnose, implied_pressure_Pa, odd_trials
-from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors, replicates_of
+from vinetrack.diagnosis.ladder import compare, position_errors, replicates_of
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.inference.fit_result import TrialFit
 
@@ -147,13 +147,6 @@ def test_a_row_that_contradicts_the_others_is_named_and_left_out(campaign):
     (note,) = (note for note in result.notes if note.code == "odd_trials")
     assert (note.facts["odd"][0][0], note.facts["others"]) == ("t2", 11)
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
-
-
-def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
-    there = initial_fit(vt.base_model(), campaign, [vt.effects.tail_friction])
-    monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", lambda *_, **__: pytest.fail("it is made again"))
-    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False, fitted=there)
-    assert result.fits[0].numbers == there.numbers
 
 
 def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):

@@ -231,11 +231,6 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     assert found.inflation == pytest.approx(inflation)
 
 
-SIZES = (1,) * 12 + (30, 6)
-NAMES = [f"effect_{k}" for k, size in enumerate(SIZES) for _ in range(size)]
-SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
-
-
 @pytest.mark.parametrize(
     ("cosines", "names", "level", "sign", "share"),
     [
@@ -250,26 +245,6 @@ SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
 def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
     family = misfit_tests.family_test(cosines, [sign] * len(names), list(names), level)
     assert family["a"] == pytest.approx(norm.isf(share), abs=0.01)
-
-
-@pytest.mark.slow
-def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_share():
-    """Against two million draws from another generator; the shapes of one effect are alike."""
-    draw, level = np.random.default_rng(20620), 3e-3
-    own = draw.standard_normal((len(SIZES), 40))[np.repeat(range(len(SIZES)), SIZES)]
-    cosines = np.corrcoef(own + draw.standard_normal((len(NAMES), 40)))
-    family = misfit_tests.family_test(cosines, SIGNS, NAMES, level)
-    limits, signs = np.array([family[name] for name in NAMES]), np.array(SIGNS)
-    draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
-    alarms, total, by_many = 0, 0, 0  # by_many: by the candidate of thirty shapes
-    for _ in range(40):
-        z = draw.standard_normal((50_000, len(NAMES))) @ root.T
-        beyond = np.where(signs == 0, np.abs(z), z * signs) > limits
-        alarms, total = alarms + int(beyond.any(axis=1).sum()), total + len(z)
-        by_many += int(beyond[:, [name == "effect_12" for name in NAMES]].any(axis=1).sum())
-    assert 0.6 * level < alarms / total < 1.1 * level
-    assert 0.5 < by_many / total / (level / len(set(NAMES))) < 2.0
-    assert family["effect_12"] > family["effect_1"] + 0.4
 
 
 def test_an_implausible_size_is_believed_where_no_other_is_plausible():
@@ -329,6 +304,11 @@ def test_positions_with_independent_noise_are_no_averages(correlation, code):
     data = (SimpleNamespace(time_s=time_s, lead_position_m=position_m, **known),)
     reasons = misfit_tests.testable([catalogue()["moving_average"]], data)[1]
     assert getattr(reasons.get("moving_average"), "code", None) == code
+    # A measured pressure holds what happens in the chamber.
+    data[0].trace = (time_s, np.full(200, 2e4))
+    assert misfit_tests.testable([catalogue()["reservoir_depletion"]], data)[1]["reservoir_depletion"].code == (
+        "in_measured_pressure"
+    )
 
 
 def test_a_set_is_worth_what_it_has_more_than_the_best_one_within_it(monkeypatch):

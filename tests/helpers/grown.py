@@ -58,6 +58,20 @@ def pairs_of(virtual: Sequence[VirtualTrial]) -> Pairs:
     return [(one.stated, one.track) for one in virtual]
 
 
+def tubes(payload_g: float = 0.0) -> list[Trial]:
+    """Two vines, three pressures each, two trials a pressure, a chamber of 3.7 L."""
+    trials = campaign(isometric_vine(4), (14, 20, 28), 2, payload_g=payload_g, prefix="a")
+    trials += campaign(isometric_vine(3), (14, 22, 40), 2, payload_g=payload_g, prefix="b")
+    return [replace(trial, chamber_m3=3.7e-3) for trial in with_names(trials)]
+
+
+def hidden(values: Mapping[str, float] | None = None, *, seed: int, trials: list[Trial] | None = None) -> Pairs:
+    """What the analysis gets of tubes that scatter, with effects whose values are given at work behind them."""
+    effects = tuple(dict.fromkeys(name.split(".")[0] for name in values or {}))
+    scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "yield_error_kPa": 0.1, "noise_correlation": 0.3}
+    return pairs_of(grown(tubes() if trials is None else trials, seed, effects, values, **scatter))
+
+
 def effect_file(folder: Path) -> Path:
     """A user's effect `hidden`: a tail force of size `a`, N, times that of `FORCES` whose place is `kind`."""
     shapes = enumerate(FORCES.values())

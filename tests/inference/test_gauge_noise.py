@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
-from lsoda_vine import N_TRUE, as_track, small_campaign
+from lsoda_vine import as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
 from vinetrack.inference.errors import with_systematics
+from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -139,24 +140,6 @@ def test_stated_errors_cover_the_actual_errors():
     assert len(sizes) >= 40
     # What all trials have together, clock and exponent, is stated √n times in each.
     assert 0.45 < np.sqrt(np.mean(np.square(sizes))) < 1.5
-
-
-@pytest.mark.parametrize("per_reading", [3.4, 5.0, 18.0])
-def test_readings_of_an_interpolated_trace_are_recovered(per_reading):
-    draw = np.random.default_rng(3)
-    read_at = np.arange(0.3, 400.0, per_reading)
-    readings_Pa = 20e3 + 100.0 * draw.standard_normal(read_at.size)
-    frames = np.arange(int(read_at[0] + 0.2 * per_reading) + 1, int(read_at[-1] - 0.2 * per_reading))
-    (told,) = gauge.gauge_readings([np.interp(frames, read_at, readings_Pa)])
-    # Those before and after the trace as well, where enough of the lines that lead to them shows.
-    places = told.places + frames[0]
-    which = np.searchsorted(read_at, places - 0.5 * per_reading)
-    assert which.size >= read_at.size - 2
-    np.testing.assert_allclose(places, read_at[which], atol=1e-4)
-    np.testing.assert_allclose(told.values_Pa, readings_Pa[which], rtol=1e-7)
-    (held,) = gauge.gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
-    assert np.isin(held.values_Pa, readings_Pa).all()
-    assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
 
 
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
@@ -334,34 +317,13 @@ def test_trace_errors_suggest_no_exponent_per_vine(fit):
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
 
 
-@pytest.mark.slow
-def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge_each_in_its_own_trial():
-    """Sixteen trials; the gauge sees each pressure as it is, not as it was set, give or take 0.1 kPa a sample."""
+def test_a_pressure_deviates_by_the_noise_of_its_gauge():
+    """Give or take 0.1 kPa a sample, of as many samples as there are since the release."""
     pairs, truth = small_campaign(seed=21)
-    seen, draw, gauge_noise_Pa = [], np.random.default_rng(21), 100.0
-    for (trial, track), true in zip(pairs, truth, strict=True):
-        gauge_Pa = trial.pressure_Pa * true["pressure"] + gauge_noise_Pa * draw.standard_normal(track.time_s.size)
+    draw, seen = np.random.default_rng(21), []
+    for trial, track in pairs:
+        gauge_Pa = trial.pressure_Pa + 100.0 * draw.standard_normal(track.time_s.size)
         seen.append((trial, as_track(track.time_s, track.lead_position_m, gauge_Pa)))
-    traced = vt.fit(vt.base_model(), seen)
-    assert traced.chi2_per_dof < 1.15
-    assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
-    for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
-        samples = np.count_nonzero(item.time_s >= trial.release_s)
-        assert item.gauge_error == pytest.approx(gauge_noise_Pa / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
-        assert abs(trial.pressure_deviation) < 4 * item.gauge_error
-    # The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds.
-    predictor = traced.predictor
-    trace = predictor.data[3].trace
-    ramp = np.linspace(-100.0, 100.0, trace[0].size)
-    data = [replace(trial_data, trace_errors_Pa=None) for trial_data in predictor.data]
-    data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
-    deaf = [replace(trial_data, trace_errors_Pa=None) for trial_data in data]
-    moved, without = (
-        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution).own for told in (data, deaf)
-    )
-    assert [each.shape[1] for each in moved] == [1] * 16
-    assert [each.shape[1] for each in without] == [0] * 16
-    assert all(not columns.any() for i, columns in enumerate(moved) if i != 3)
-    part = np.interp(data[3].time_s, trace[0], ramp) / np.interp(data[3].time_s, *trace)
-    expected = np.cumsum(np.diff(traced.solution.columns[3][:, PRESSURE], prepend=0.0) * part)
-    assert moved[3][:, 0] == pytest.approx(expected, abs=0.05 * np.ptp(expected))
+    for item, true in zip(prepare(seen)[0], truth, strict=True):
+        samples = np.count_nonzero(item.time_s >= true["release_s"])
+        assert item.gauge_error == pytest.approx(100.0 / np.sqrt(samples) / item.trial.pressure_Pa, rel=0.4)
