@@ -357,23 +357,6 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
     return start_px + speed * np.maximum(frames - rest, 0.0)
 
 
-GRAINS = [{}, {"wall_sd": 30.0, "tail_sd": 30.0}, {"wall_sd": 5.0, "tail_sd": 45.0}, {"background_sd": 30.0}]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("changes", [*GRAINS, {"door": True}])
-def test_stated_errors_match_the_true_errors(changes):
-    """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
-    pulls = []
-    for seed in (331, 332):
-        scene, tracking = followed(**changes, seed=seed)
-        use = scene.moving & tracking.track.usable
-        error = (tracking.track.edge_px + tracking.axis.from_px[0] - scene.edge_px)[use]
-        sigma = tracking.track.lead_position_sigma_m[use] * 1e3
-        pulls.append(np.diff(error, 2) / np.sqrt(sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2))
-    assert 0.6 < np.sqrt(np.mean(np.concatenate(pulls) ** 2)) < 1.3
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
