@@ -28,7 +28,7 @@ from vinetrack.core.records import Trial
 from vinetrack.core.tables import parse_number, parse_table
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.pipeline.workflow import make_plan
-from vinetrack.results import describe_run, read_result
+from vinetrack.results import describe_run
 from vinetrack.tracks.importers import read_pressure_trace, read_track
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.track import track_recording
@@ -216,24 +216,6 @@ def test_every_float_is_read_back(value):
 def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path, seed):
     write_experiment(tmp_path / "drawn", seed)
     assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []
-
-
-@pytest.mark.slow
-def test_a_single_trial_of_a_falling_ball_reaches_the_end_and_gives_g(tmp_path):
-    folder = tmp_path / "ball"
-    folder.mkdir()
-    time_s = np.arange(120) / 240
-    position_m = 0.5 * 9.81 * np.clip(time_s - 0.02, 0, None) ** 2 + np.random.default_rng(1).normal(0, 2e-4, 120)
-    lines = [f"{t:.5f},{y:.6f}" for t, y in zip(time_s, position_m, strict=True)]
-    (folder / "b.csv").write_text("\n".join(["time_s,position_m", *lines, ""]))
-    (folder / "trials.csv").write_text("trial,track,diameter_mm,payload_g,travel_ratio\nb,b.csv,20,30,1\n")
-    (folder / "experiment.yaml").write_text("model: [gravity]\n")
-    assert is_let_through(folder)
-    assert run_through(folder, tmp_path / "out") == []
-    (g,) = json.loads((tmp_path / "out" / "fit.json").read_text())["numbers"]
-    assert abs(g["value"] - 9.81) < 4 * g["sigma"] < 0.06
-    (row,) = read_result(tmp_path / "out" / "comparison.csv").itertuples()
-    assert row.rms_position_m == pytest.approx(2e-4, rel=0.15)  # the noise
 
 
 X, Y = np.meshgrid(np.arange(160), np.arange(64))

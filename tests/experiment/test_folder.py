@@ -11,7 +11,7 @@ import yaml
 from hand_sheet import GOOD, HEADER, TRACK, one, stopped, two_vines, write
 from pydantic import BaseModel
 
-from vinetrack.core.problems import ExperimentError, InputError, Problem, format_problems
+from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
 from vinetrack.core.tables import read_yaml
 from vinetrack.core.units import convert, other_units, pressure_text, split_unit
@@ -38,7 +38,6 @@ from vinetrack.experiment.settings import (
     setting_entries,
 )
 from vinetrack.pipeline.workflow import model_problems
-from vinetrack.tracks.importers import load_track, read_track
 from vinetrack.video.survey import in_no_row
 
 
@@ -385,21 +384,6 @@ def test_settings_cover_exactly_the_columns_of_the_sheet():
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
 
 
-def test_every_kind_of_calibration(tmp_path):
-    for text in (
-        "{kind: mm_per_px, mm_per_px: 0.37}",
-        "{kind: two_points, from_px: [1, 2], to_px: [3, 4], length_mm: 100}",
-        "{kind: checkerboard, image: calibration/a.png, squares: [9, 6], square_mm: 5}",
-        "{kind: charuco, image: a.png, squares: [5, 7], square_mm: 10, marker_mm: 7, dictionary: DICT_4X4_50}",
-    ):
-        settings = read(tmp_path, f"calibration: {text}\naxis: {{from_px: [0, 1], to_px: [5, 1], width_mm: 40}}\n")
-        assert settings.calibration is not None
-        assert settings.calibration.kind in text
-        assert settings.axis is not None
-        assert settings.axis.to_px == (5.0, 1.0)
-    assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)  # no number in base sixty
-
-
 def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path):
     text = "{pressure_kPa: 7:40, payload_g: [0, 50], diameter_mm: [24, 12], chamber_l: 3.7, growth_angle_deg: 0:180}"
     limits = read(tmp_path, f"limits: {text}\n").limits
@@ -407,6 +391,7 @@ def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path):
     assert (limits.diameter_mm, limits.chamber_l) == ((12.0, 24.0), (3.7,))
     assert limits.growth_angle_deg == (0.0, 45.0, 90.0, 135.0, 180.0)
     assert (limits.thickness_um, limits.trials, limits.hoop_stress_MPa) == (None, 4, 7.8)
+    assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)  # no number in base sixty
 
 
 def test_what_is_no_mapping_is_refused(tmp_path):
@@ -578,26 +563,6 @@ def test_the_name_of_a_condition_shows_what_differs():
     # Another vine has a yield pressure of its own.
     named = with_names([TRIAL, replace(TRIAL, name="b", diameter_m=0.012, thickness_m=1e-4, yield_pressure_Pa=5e3)])
     assert [trial.condition for trial in named] == [base, "12mm-100um-280mm_28kPa_0g"]
-
-
-def test_frames_and_axis_of_one_trial_alone(tmp_path):
-    (trial,) = one(tmp_path, frames_used="5:15", axis="161,40:151.5,799:20").trials
-    assert trial.axis == PictureAxis((161.0, 40.0), (151.5, 799.0), pytest.approx(0.02))
-    track = load_track(trial)
-    assert np.flatnonzero(track.usable).tolist() == list(range(5, 16))
-    assert (track.flag[0], track.flag[-1]) == ("rejected", "after_end")
-
-
-@pytest.mark.real
-def test_either_of_two_point_masses_of_a_real_project(real):
-    path = real / "falling_cups" / "cups.trk"
-    with pytest.raises(InputError, match="no point named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
-        read_track(path, point_mass="cup")
-    third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
-    # The heavier stack falls further over the same frames.
-    common = min(third.time_s.size, seventh.time_s.size)
-    assert np.ptp(seventh.lead_position_m[:common]) > np.ptp(third.lead_position_m[:common])
-    assert 5 <= read_track(path, point_mass="cup 3", frames_used=(2, 8)).time_s.size < third.time_s.size
 
 
 PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)

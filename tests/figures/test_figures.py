@@ -71,11 +71,6 @@ def scaling() -> dict:
     return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
 
 
-def test_the_same_figure_gives_the_same_bytes():
-    first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
-    assert first == second
-
-
 @pytest.mark.slow
 def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
     for n_vines in (4, 20):

@@ -1,7 +1,6 @@
 """A results folder in memory: the same quantity has one value in files, report, command line, explorer and Python; the
 story of the README and the notebook of the documentation run on it."""
 
-import html
 import json
 import re
 from pathlib import Path
@@ -16,7 +15,6 @@ from matplotlib.figure import Figure
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.units import number
-from vinetrack.narrative.verdict_text import estimate_text, verdict_table
 from vinetrack.pages.page import open_campaign
 from vinetrack.results import ResultsError
 
@@ -123,29 +121,6 @@ def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored():
     printed = [["".join(one["text"]) for one in each if "text" in one] for each in (shown, stored)]
     assert printed[0] == printed[1]
     assert "n = 0.369 instead of" in printed[0][0]
-
-
-@pytest.fixture(scope="module")
-def report(small_run):
-    """The words of the page."""
-    page = (small_run / "report.html").read_text("utf-8")
-    page = re.sub(r"<(script|style|svg)\b.*?</\1>", " ", page, flags=re.DOTALL)
-    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", re.sub("</?code>", "", page))).split())
-
-
-def test_the_report_quotes_the_final_model_first(report, loaded):
-    diagnosis = loaded.diagnosis
-    assert diagnosis is not None
-    last = loaded.ladder.iloc[-1]
-    first_mm, last_mm = (number(1e3 * loaded.ladder["rms_left_out_m"].iloc[k]) for k in (0, -1))
-    assert f"{first_mm} → {last_mm} mm" in report
-    assert f"an adequate model {number(1e3 * last['expected_m'])} mm" in report
-    for entry in diagnosis.parameters:
-        assert estimate_text(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
-    assert report.index("The final model:") < report.index("The initial model, which the diagnosis refutes")
-    for row in verdict_table(diagnosis)[1:]:
-        assert f"{row.question} {row.answer}".replace("`", "").replace(diagnosis.results, "results/demo") in report
-        assert row.note.replace("`", "") in report
 
 
 def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):

@@ -107,16 +107,6 @@ def test_error_of_the_speed_is_honest_at_constant_speed(rho):
     assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
 
 
-def test_a_long_plateau_does_not_swallow_its_start_up():
-    time_s = np.arange(600) / 1000
-    moving = np.maximum(time_s - 0.05, 0)
-    y = 0.5 * (moving - 0.02 * (1 - np.exp(-moving / 0.02)))
-    window = gated(plain_track(time_s, y + ar1(600, 3e-5, 0.0, np.random.default_rng(1000))))
-    assert window.accepted
-    assert window.from_s > 0.05 + 3 * 0.02
-    assert window.x_ss_m_s == pytest.approx(1.0, rel=1e-3)
-
-
 @pytest.mark.parametrize(("drift_limit", "doubtful"), [(0.03, False), (0.005, True)])
 def test_a_window_chosen_by_hand_is_used_and_judged_by_the_limits_of_the_run(drift_limit, doubtful):
     track = ramp(0.01, 1e-5)

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commanded import run, succeed
+from explorer_campaign import write_bars
 from plain_scene import Plan, plain_scene, write_video
 
 from vinetrack.experiment.folder import read_experiment
@@ -229,10 +230,7 @@ def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
     experiment, results = folder / "vines", folder / "out"
     experiment.mkdir(parents=True)
     edge, time_s = edge_px(), np.arange(N) / 1000
-    pictures = np.full((N, HEIGHT, WIDTH, 3), 60, np.uint8)
-    for picture, end_px in zip(pictures, edge, strict=True):
-        picture[40:80, : int(end_px)] = 180
-    write_clip(experiment / "a.mp4", list(pictures), 30)
+    write_bars(experiment / "a.mp4", edge, WIDTH, HEIGHT)
     rows = ["trial,video,capture_fps,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px"]
     trials = {"a": 24, "b": 24, "c": 30, "torn": 36}
     rows += [f"{name},a.mp4,1000,20,100,180,{kPa},3,{MM_PER_PX}" for name, kPa in trials.items()]

@@ -162,6 +162,8 @@ def test_times_of_a_clock_are_refused_and_a_particle_has_its_number_as_name(tmp_
         read_track(write(tmp_path, clock), **SHEET)
     floats = FOREIGN["trackpy"].replace(",3\n", ",3.0\n")
     assert read_track(write(tmp_path, floats), point_mass="3", **SHEET).usable.sum() == len(PIXELS)
+    tip = read_track(write(tmp_path, FOREIGN["DeepLabCut"]), point_mass=" Tip", **SHEET)
+    assert tip.usable.sum() == len(PIXELS)
 
 
 def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path):
