@@ -1,6 +1,7 @@
 """The force that a model lacks: its algebra against closed forms, hidden forces, their laws and effect files."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -114,6 +115,15 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     # A spring far too stiff for the steps is at rest there: the method is L-stable.
     stiff, _ = inversion.integrate_responses(time_s, -1e10 + 0 * time_s, *pushed[1:])
     assert stiff[0, -1, 0] == pytest.approx(1e-10)
+
+
+def test_a_step_that_leaves_a_trial_without_points_leads_where_nothing_can_be_computed(tmp_path):
+    pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
+    problem = inversion.ForceProblem(vt.fit(vt.base_model(), pairs))
+    domain = learning.candidate_domains(problem.start.motions)[0]
+    late = replace(problem.start, trial_effects=problem.start.trial_effects - [0.0, 1.0, 0.0, 0.0])
+    with pytest.raises(np.linalg.LinAlgError):
+        inversion.ForceEquations(problem, late, domain.unit_push)
 
 
 def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
@@ -248,6 +258,17 @@ def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]
     assert effect.worked[0].expected != 0
+
+
+@pytest.mark.slow
+def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path):
+    pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
+    proposal = propose(vt.base_model(), pairs, lambda _: None)
+    best = proposal.tied[0]
+    assert best.effect.name == "proposed_time"
+    rate = next(number for number in best.ratio.fit.numbers if number.key == "proposed_time.k")
+    assert rate.low < -0.3 / 0.2 < rate.high
+    assert best.rms_left_out_m < proposal.rms_left_out_m
 
 
 @pytest.mark.slow
