@@ -564,6 +564,19 @@ def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
     assert only_in_motion["n"].sigma < 0.02
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("early_frames", [5, 20, 45])
+def test_the_same_numbers_are_reached_from_any_initial_release(only_in_motion, early_frames):
+    """A release that the tracks hardly tell may end elsewhere; the answer set counts differences of ln L from 4.5."""
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    own = solution.state.trial_effects.copy()
+    own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
+    found = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms())
+    assert found.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=1.0)
+    moved = predictor.layout.values(found.state.theta) - predictor.layout.values(solution.state.theta)
+    assert np.abs(moved / [number.sigma for number in only_in_motion.numbers]).max() < 0.1
+
+
 def test_a_fit_converges_from_its_own_solution(only_in_motion):
     """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
