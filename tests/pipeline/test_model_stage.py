@@ -30,7 +30,7 @@ SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_press
 
 def write_experiment(folder: Path, pairs: Iterable[tuple[Trial, Track]], angles_deg: Sequence[int] = ()) -> Path:
     """The tracks of trials, and their sheet."""
-    tracks.write_experiment([SimpleNamespace(stated=trial, track=track) for trial, track in pairs], folder)
+    campaigns.write_experiment([SimpleNamespace(stated=trial, track=track) for trial, track in pairs], folder)
     if angles_deg:
         pd.read_csv(folder / "trials.csv").assign(growth_angle_deg=angles_deg).to_csv(
             folder / "trials.csv", index=False

@@ -27,7 +27,6 @@ from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.analysis import analyse_trials
 from vinetrack.pipeline.workflow import Job, Kept, map_unordered
 from vinetrack.report import build as clips
-from vinetrack.report.build import write_clip
 from vinetrack.results import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import NO_GROWTH, Tracking
