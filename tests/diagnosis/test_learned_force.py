@@ -73,7 +73,7 @@ def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparamet
     design = smooth.splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
     sizes, hypotheses = np.geomspace(0.1, 3.0, 4), GROWTH.hypotheses
-    assert {start for start, _ in hypotheses} == {learning.ZERO_AT_START, learning.CONSTANT_AT_START}
+    assert {start for start, _ in hypotheses} == {"nothing", "a constant"}
     modes = [GROWTH.modes(*each) for each in hypotheses]
     found = smooth.posterior(design.T @ design, design.T @ positions, modes, sizes)
     logs, means, covariances = [], [], []

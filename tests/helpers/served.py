@@ -7,7 +7,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import Queue
@@ -120,3 +120,14 @@ class Visitor:
         """Click on an element of a widget."""
         x, y, _ = self.place(name, inside)
         self.chrome.click(x, y)
+
+    def drag(self, name: str, path: list[float], after: Callable[[], None]) -> None:
+        """Drag a slider by fractions of its width, positive to the right; `after` is called after every move."""
+        _, _, whole = self.place(name, ".noUi-target")
+        x, y, _ = self.place(name, ".noUi-handle")
+        self.chrome.mouse("move", x, y)
+        self.chrome.mouse("press", x, y)
+        for part in path:
+            self.chrome.mouse("move", x + part * whole, y, held=True)
+            after()
+        self.chrome.mouse("release", x + path[-1] * whole, y)
