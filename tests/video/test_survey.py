@@ -136,10 +136,12 @@ SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
 
 @pytest.mark.parametrize(("slopes_deg", "named"), SLOPES_DEG)
 def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg, named):
-    found, trials = dict(zip("abcde", slopes_deg, strict=False)), [replace(VINE, name=name) for name in "abcde"]
+    found, trials = {}, [replace(VINE, name=name) for name in "abcde"]
+    for name, slope in zip("abcde", np.radians(slopes_deg), strict=False):
+        found[name] = {"from_px": (20.0, 30.0), "to_px": (20.0 + 90.0 * np.cos(slope), 30.0 + 90.0 * np.sin(slope))}
     given = PictureAxis((0.0, 0.0), (50.0, 0.0))
-    assert askew_trials(found, [replace(trial, axis=given) for trial in trials]) == []
-    assert [name for names, _ in askew_trials(found, trials) for name in names] == list(named)
+    assert askew_trials(found, [replace(trial, axis=given) for trial in trials]) == {}
+    assert askew_trials(found, trials) == dict.fromkeys(named, len(slopes_deg) - len(named))
 
 
 @pytest.fixture(scope="module")

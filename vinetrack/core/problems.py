@@ -85,12 +85,13 @@ class ExperimentError(UserError):
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Format problems, errors first, as at most `limit` lines; the last counts the rest. Those that differ only in
-    trial, line and measured number are one, and cells beyond the same bound of a column.
+    trial, line and measured number are one, as are cells beyond the same bound of a column, and files that a column names
+    and nobody finds.
     """
     groups: dict[Problem, list[Problem]] = {}
     for problem in sorted(problems, key=lambda problem: ("error", "warning", "note").index(problem.severity)):
         alike = replace(problem, trial="", line=0, message="" if problem.of_a_measurement else problem.message)
-        alike = replace(alike, value=None, remedy="") if problem.code.endswith("_bounds") else alike
+        alike = replace(alike, value=None, remedy="") if problem.code.endswith(("_bounds", "no_file")) else alike
         groups.setdefault(alike, []).append(problem)
     merged = [
         group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")

@@ -79,7 +79,7 @@ from vinetrack.results import (
 )
 from vinetrack.tracks.frame_timing import correct_frames, longer_than_stated, mean_speed
 from vinetrack.tracks.importers import load_track, with_pressure_trace
-from vinetrack.video.axis import askew_trials, axis_entry, slope_deg
+from vinetrack.video.axis import askew_trials, axis_entry
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
 
@@ -270,15 +270,14 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     if experiment.settings.axis is None:
         # Those whose axis is askew to that of most other trials with the same growth angle failed.
-        slopes_deg = {
-            name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
+        axes = {
+            name: axis
             for name, content in analysed.items()
             if content["row"]["status"] != "failed" and (axis := content.get("axis"))
         }
-        for names, agreed in askew_trials(slopes_deg, experiment.trials):
-            for name in names:
-                row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
-                analysed[name] = {"row": row, "windows": [], "point": None}
+        for name, agreed in askew_trials(axes, experiment.trials).items():
+            row = _bare_row(name, "failed", str(remark("axis_askew", count=agreed)), experiment.trial(name))
+            analysed[name] = {"row": row, "windows": [], "point": None}
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = table_of(TRIALS_COLUMNS, [rows[name] for name in experiment.names])

@@ -472,6 +472,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
     from vinetrack.tracks.importers import track_lines
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
+    from vinetrack.video.axis import askew_trials, axis_entry
     from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
     surveyor = Surveyor(keep)
@@ -483,6 +484,11 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         return CheckReport(tuple(problems), (), (), ())
     problems += [*in_no_row(experiment), *model_problems(experiment)]
     entries = list(surveyor.facts.values())
+    axes = {} if experiment.settings.axis else {entry.trial: axis_entry(entry.axis) for entry in entries if entry.axis}
+    problems += [
+        Problem("axis_askew", str(remark("axis_askew", count=agreed)), severity="warning", file=SHEET, trial=name)
+        for name, agreed in askew_trials(axes, experiment.trials).items()
+    ]
     problems += [
         Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
         for name, why in not_measured(tracks).items()

@@ -743,29 +743,27 @@ def find_curve(small: SmallPictures) -> Axis | None:
 # Whether the growth axes of recordings agree: vines filmed by one camera grow along one line of its picture.
 
 
-def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
-    """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line."""
-    return math.nan if bends else math.degrees(math.atan2(to_px[1] - from_px[1], to_px[0] - from_px[0]))
-
-
-def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:
-    """Trials whose axis was found askew to that of most others that grow at the same angle, and how many agree; none
-    where fewer than three agree, or not most. Bodies that fly free and trials with a given axis are not compared.
+def askew_trials(axes: Mapping[str, Mapping[str, Any]], trials: Iterable[Trial]) -> dict[str, int]:
+    """Trials whose axis (as `axis_entry` writes it) was found askew to that of most others that grow at the same angle,
+    and how many agree; none where fewer than three agree, or not most. A curve agrees with no line. Bodies that fly
+    free and trials with a given axis are not compared.
     """
     by_angle: dict[float, dict[str, float]] = {}
     for trial in trials:
-        if trial.name in slopes_deg and trial.axis is None and trial.travel_ratio != 1:
-            by_angle.setdefault(trial.growth_angle_rad, {})[trial.name] = slopes_deg[trial.name]
+        if trial.name in axes and trial.axis is None and trial.travel_ratio != 1:
+            (x0, y0), (x1, y1) = (axes[trial.name][end] for end in ("from_px", "to_px"))
+            slope = math.nan if "via_px" in axes[trial.name] else math.degrees(math.atan2(y1 - y0, x1 - x0))
+            by_angle.setdefault(trial.growth_angle_rad, {})[trial.name] = slope
     # Angle between a recording's axis and that of most others above which the recording is named (chosen)
-    askew_deg, found = 10.0, []
+    askew_deg, found = 10.0, dict[str, int]()
     for slopes in by_angle.values():
         straight = [slope for slope in slopes.values() if math.isfinite(slope)]
         agreeing = [sum(_apart_deg(slope, other) < askew_deg for other in straight) for slope in straight]
         common = straight[int(np.argmax(agreeing))] if straight else 0.0
         names = [name for name, slope in slopes.items() if not _apart_deg(slope, common) < askew_deg]
         # 3: fewest recordings whose axes agree from which the others are judged (chosen)
-        if names and 3 <= (agreed := len(slopes) - len(names)) > len(names):
-            found.append((names, agreed))
+        if 3 <= (agreed := len(slopes) - len(names)) > len(names):
+            found |= dict.fromkeys(names, agreed)
     return found
 
 
