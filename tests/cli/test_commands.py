@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -24,7 +25,7 @@ import vinetrack as vt
 from vinetrack.core.tables import write_json
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import propose as proposing
-from vinetrack.diagnosis.propose import propose
+from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model, probe
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
@@ -80,7 +81,7 @@ LADDER = (
 
 
 @pytest.mark.slow
-def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path):
+def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, monkeypatch):
     trials = tubes()[6:]  # one vine at three pressures, twice each
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.2}
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005}
@@ -131,6 +132,14 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path):
     assert read_experiment_settings(folder / "experiment.yaml").model[-2:] == ("reservoir_depletion", "leak")
     assert command_for_results(folder, results) in output.replace("\n", " ")
     assert run("add", "reservoir_depletion", results).exit_code == 1
+
+    def unfinished(*given):
+        before, after, table = add(*given)
+        return before, replace(after, converged=False), table
+
+    monkeypatch.setattr(proposing, "add", unfinished)
+    assert run("add", "air_drag", results, "--save").exit_code == 1
+    assert "air_drag" not in read_experiment_settings(folder / "experiment.yaml").model
 
 
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.

@@ -346,12 +346,18 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
         )
     tracks = {trial.name: track for trial, track in layout.measured_trials(read, layout.Results(results))}
     before, after, ladder = add(read, tracks, names, report)
-    lines = added_in_words(before, after, ladder)
-    if save:
+    lines, saved = added_in_words(before, after, ladder), save and after.converged
+    if saved:
         added = [Path(name).stem for name in names]
         path = save_model(read.folder, [*read.settings.model, *added], [file.name for file in own_files])
         lines.append(f"Saved to {path}; to update all results: {workflow.command_for_results(read.folder, results)}")
-    return lines, {"effect": effect, "saved": save, "lines": lines, "ladder": ladder.to_dict("records")}
+    elif save:
+        model_of = read.folder / "experiment.yaml"
+        lines.append(
+            f"error: not saved: the fit did not converge. To use it all the same, name it in model: of {model_of}"
+        )
+    content = {"effect": effect, "saved": saved, "lines": lines, "ladder": ladder.to_dict("records")}
+    return lines, content, save and not saved
 
 
 @command()

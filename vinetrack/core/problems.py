@@ -85,8 +85,7 @@ class ExperimentError(UserError):
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Format problems, errors first, as at most `limit` lines; the last counts the rest. Those that differ only in
-    trial, line and measured number are one, as are cells beyond the same bound of a column, and files that a column names
-    and nobody finds.
+    trial, line and measured number are one; so are cells beyond the same bound of a column, and files not found.
     """
     groups: dict[Problem, list[Problem]] = {}
     for problem in sorted(problems, key=lambda problem: ("error", "warning", "note").index(problem.severity)):

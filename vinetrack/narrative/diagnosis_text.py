@@ -359,7 +359,7 @@ def proposal_lines(proposal: Proposal) -> list[str]:
         lines.append(line + " (not excluded)" * (law in proposal.tied[1:]))
     if proposal.tied:
         best, *others = [law.words for law in proposal.tied]
-        lines.append(f"Proposed: {best}.")
+        lines.append(f"Proposed, fitted with the model: {best}.")
         lines += [f"These data fit nearly as well with {joined(others)}."] if others else []
     else:
         lines.append(f"{proposal.reason}{'' if proposal.table else '; nothing is proposed'}.")

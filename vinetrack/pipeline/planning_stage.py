@@ -181,7 +181,7 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
         if abs(one.change) >= 0.005
     ]
     if changes:
-        yield from ("", *table(changes, ("not in the model", "at the size", "final speed", "change"), align="<<<>"))
+        yield from ("", *table(changes, ("not in the model", "at its usual size", "final speed", ""), align="<<<>"))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 
