@@ -352,9 +352,8 @@ def _add(effect: str, results: Path, save: bool, experiment: Path | None, report
         path = save_model(read.folder, [*read.settings.model, *added], [file.name for file in own_files])
         lines.append(f"Saved to {path}; to update all results: {workflow.command_for_results(read.folder, results)}")
     elif save:
-        model_of = read.folder / "experiment.yaml"
         lines.append(
-            f"error: not saved: the fit did not converge. To use it all the same, name it in model: of {model_of}"
+            "error: not saved, since the fit did not converge; a `model` in experiment.yaml may name it all the same"
         )
     content = {"effect": effect, "saved": saved, "lines": lines, "ladder": ladder.to_dict("records")}
     return lines, content, save and not saved
