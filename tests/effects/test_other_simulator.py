@@ -10,22 +10,10 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+import by_hand
 import numpy as np
 import pytest
-from by_hand import (
-    ATM,
-    BARE,
-    LEVEL,
-    LOADED,
-    RT_AIR,
-    G,
-    N,
-    Vine,
-    assert_same_motion,
-    followed,
-    simulated,
-    whole_catalogue,
-)
+from by_hand import BARE, LEVEL, LOADED, G, N, Vine, assert_same_motion, followed, simulated, whole_catalogue
 from hidden import EFFECTS
 from hidden.verify import FRAME_S, SIZES, ours, trials
 from numba import njit
@@ -218,7 +206,7 @@ def test_gauge_then_chamber_then_leak_then_inlet_then_stretch():
         leaked = P * math.exp(-2.0 * t)
         area = vine.A
         for _ in range(60):
-            rho = (leaked + ATM) / RT_AIR
+            rho = (leaked + by_hand.ATM) / by_hand.RT_AIR
             tip = leaked - 1.5 * 0.5 * rho * (v / 2) ** 2 * (area / A_in) ** 2
             area = vine.A * (1 + 4e-6 * tip) ** 2
         return tip, area
@@ -229,7 +217,7 @@ def test_gauge_then_chamber_then_leak_then_inlet_then_stretch():
 
     def rate(t: float, x: float, v: float, P: float) -> float:
         area = at_the_tip(t, v, P)[1]
-        return -1.4 * (P + ATM) * area * (v / 2) / (V0 + area * x / 2) + (P_0 - P) / 0.05
+        return -1.4 * (P + by_hand.ATM) * area * (v / 2) / (V0 + area * x / 2) + (P_0 - P) / 0.05
 
     assert_same_motion(vine, sizes, acceleration, chamber=(P_0, rate))
 

@@ -15,28 +15,11 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
 from vinetrack.core.tables import read_yaml
 from vinetrack.core.units import convert, other_units, pressure_text, split_unit
-from vinetrack.experiment.folder import (
-    Experiment,
-    check_experiment,
-    corrections_text,
-    order_pressure_correlation,
-    planned_sheet,
-    planned_trial,
-    read_corrections,
-    read_experiment,
-    systematic_of_travel,
-    trial_order,
-)
+from vinetrack.experiment import folder as sheets
+from vinetrack.experiment import settings as keys
+from vinetrack.experiment.folder import Experiment, check_experiment, planned_sheet, read_experiment
 from vinetrack.experiment.schema import COLUMNS, SHARED, with_names
-from vinetrack.experiment.settings import (
-    ExperimentSettings,
-    RunSettings,
-    read_experiment_settings,
-    reference_content,
-    reference_page,
-    run_settings,
-    setting_entries,
-)
+from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
 from vinetrack.pipeline.workflow import model_problems
 from vinetrack.video.survey import in_no_row
 
@@ -237,7 +220,7 @@ def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_st
         trial = one(folder, f"position{setting}\n" if setting else "").trials[0]
         assert trial.position_systematic_m == pytest.approx(expected_m, nan_ok=True)
     demo = read_experiment_settings(Path(__file__).parents[2] / "data" / "demo" / "experiment.yaml")
-    assert [systematic_of_travel(demo, elsewhere) for elsewhere in (False, True)] == [5e-5, 4e-4]
+    assert [sheets.systematic_of_travel(demo, elsewhere) for elsewhere in (False, True)] == [5e-5, 4e-4]
 
 
 def test_check_names_the_trial_whose_track_is_wrong(folder):
@@ -467,15 +450,15 @@ def test_a_wrong_run_setting_is_named():
 
 
 def test_every_key_of_both_files_is_listed_once():
-    names = [entry["name"] for part in ("experiment", "columns") for entry in reference_content()[part]]
+    names = [entry["name"] for part in ("experiment", "columns") for entry in keys.reference_content()[part]]
     assert {name for name in names if names.count(name) > 1} == {"axis"}  # of all trials, and of one
     assert set(ExperimentSettings.model_fields) <= set(names)
-    assert set(RunSettings.model_fields) <= {entry.name for entry in setting_entries(RunSettings)}
+    assert set(RunSettings.model_fields) <= {entry.name for entry in keys.setting_entries(RunSettings)}
 
 
 def test_the_page_of_the_docs_is_current():
     page = Path(__file__).parents[2] / "docs" / "settings.md"
-    assert page.read_text(encoding="utf-8") == reference_page(), "vinetrack settings --page docs/settings.md"
+    assert page.read_text(encoding="utf-8") == keys.reference_page(), "vinetrack settings --page docs/settings.md"
 
 
 # What a sheet says of trials: conditions, order, columns of one alone, other units, corrections; planned ones.
@@ -492,10 +475,10 @@ def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path
     assert [(one.frame, one.action) for one in trial.corrections] == [(3, "drop"), (12, "move"), (40, "confirm")]
     assert trial.corrections[1].edge_px == 310.5
     given = {"a": (Correction(3, "drop"), Correction(12, "move", 310.5))}
-    (tmp_path / "corrections.csv").write_text(corrections_text(given))
-    found, problems = read_corrections(tmp_path)
+    (tmp_path / "corrections.csv").write_text(sheets.corrections_text(given))
+    found, problems = sheets.read_corrections(tmp_path)
     assert problems == []
-    assert corrections_text(found) == corrections_text(given)
+    assert sheets.corrections_text(found) == sheets.corrections_text(given)
 
 
 def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path):
@@ -586,13 +569,13 @@ def test_times_in_milliseconds_are_asked_about(tmp_path):
 def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path):
     cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
     trials = read_experiment(written(tmp_path, ",specimen,day,order", cells)).trials
-    ranks, stated = trial_order(trials)
+    ranks, stated = sheets.trial_order(trials)
     assert (stated, ranks.tolist()) == (True, list(range(9, -1, -1)))
     assert len({trial.condition for trial in trials}) == 5, "they are replicates all the same"
     trials = read_experiment(written(tmp_path)).trials
-    ranks, stated = trial_order(trials)
+    ranks, stated = sheets.trial_order(trials)
     assert (stated, ranks.tolist()) == (False, list(range(10)))
-    assert order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
+    assert sheets.order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
 
 
 def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_path):
@@ -629,7 +612,7 @@ def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_
     (problem,) = caught.value.problems
     assert (problem.file, problem.line, problem.trial, problem.column) == ("trials.csv", 2, "a", "pressure_kPa")
     with pytest.raises(ExperimentError) as caught:
-        planned_trial({**VINE, "travel_ratio": "1"})  # a body that moves as a whole is not predicted
+        sheets.planned_trial({**VINE, "travel_ratio": "1"})  # a body that moves as a whole is not predicted
     assert any("--travel-ratio" in str(problem) for problem in caught.value.problems)
 
 

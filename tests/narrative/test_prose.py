@@ -13,17 +13,8 @@ from hand_diagnosis import diagnosis
 import vinetrack
 from vinetrack.core.problems import remark
 from vinetrack.core.units import display_unit
-from vinetrack.diagnosis.result import (
-    PROBABILITIES,
-    VERDICTS,
-    Candidate,
-    Diagnosis,
-    EffectPower,
-    FurtherTrials,
-    Power,
-    PowerInput,
-    Round,
-)
+from vinetrack.diagnosis import result
+from vinetrack.diagnosis.result import VERDICTS, Candidate, Diagnosis, EffectPower, Power, Round
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import templates
 from vinetrack.narrative.diagnosis_text import REMARKS, drift_text, further_lines
@@ -70,7 +61,7 @@ def test_a_size_that_is_named_though_implausible_is_said_to_be_so_beside_it():
 
 
 def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:
-    sizes = tuple(float(size) for size in at_half * np.linspace(0.5, 1.5, len(PROBABILITIES)))
+    sizes = tuple(float(size) for size in at_half * np.linspace(0.5, 1.5, len(result.PROBABILITIES)))
     return EffectPower(name, "physical", f"{name}.size", symbol, "1", 0.0, 0.0, largest, sizes, {"inlet_loss": 0.26})
 
 
@@ -82,7 +73,7 @@ POWER = Power(
         Number("eversion_damping.n", "", "n", "1", 0.37, 0.0037, 0.3625, 0.3775),
         Number("eversion_damping.B", "tube", "B", "", 6.4, 0.11, 6.4 * 0.966, 6.4 * 1.034),
     ),
-    inputs=(PowerInput("frame rate", "1069 /s", "sheet"),),
+    inputs=(result.PowerInput("frame rate", "1069 /s", "sheet"),),
 )  # fmt: skip
 
 
@@ -97,7 +88,7 @@ def power() -> str:
 
 
 def plan() -> str:
-    none = FurtherTrials(POWER["fold_inertia"], 0.5, 0.9, 0.2)
+    none = result.FurtherTrials(POWER["fold_inertia"], 0.5, 0.9, 0.2)
     enough, never = replace(none, before=0.95), replace(none, unlimited=0.4, n_conditions=12)
     trials = [{"replicates": 2, "pressure_kPa": 30.0, "payload_g": 20.0, "diameter_mm": 24.0, "thickness_um": 200.0,
                "length_mm": 280.0, "chamber_l": 3.7, "inlet_mm": 5.7, "growth_angle_deg": math.nan,

@@ -15,14 +15,7 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.tracks import position_noise as module
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
-from vinetrack.tracks.position_noise import (
-    ar1_noise,
-    detect_smoothing,
-    find_outliers,
-    noise_shape,
-    position_noise,
-    reject_outliers,
-)
+from vinetrack.tracks.position_noise import detect_smoothing, noise_shape, position_noise, reject_outliers
 
 FRAMES = np.arange(300) / 1069
 
@@ -169,11 +162,11 @@ def rejected(track: Track) -> list[int]:
 def test_an_undisturbed_motion_has_no_outlier():
     """A release, growth and correlated noise, 24 tracks: 2.4 % probability of a single point with normal noise."""
     tracks = [track for seed in range(20000, 20006) for track in recorded(seed, 5 if seed % 2 else 0)]
-    assert not any(find_outliers(track.time_s, track.lead_position_m).any() for track in tracks)
+    assert not any(module.find_outliers(track.time_s, track.lead_position_m).any() for track in tracks)
     time_s = np.arange(300) * FRAME_S
     noise_m = np.hypot(5e-5, 6e-5 * 40.0 * time_s)  # that grows with speed
     y = 20.0 * time_s**2 + noise_m * np.random.default_rng(20002).standard_normal(time_s.size)
-    assert not find_outliers(time_s, y).any()
+    assert not module.find_outliers(time_s, y).any()
 
 
 def test_one_in_a_hundred_points_is_named_and_one_in_eight_describes_no_motion():
@@ -238,7 +231,7 @@ def smooth_tracks(seed: int, rho: float = 0.0, smooth=lambda y: y) -> list[tuple
     """Eight, from rest at 20 ms, at up to 3 m/s."""
     draw, since = np.random.default_rng(seed), np.clip(TIME_S - 0.02, 0.0, None)
     grown_m = 3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01)))
-    noisy = [grown_m + ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(8)]
+    noisy = [grown_m + module.ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(8)]
     return [(TRIAL, as_track(TIME_S, smooth(y))) for y in noisy]
 
 

@@ -25,14 +25,7 @@ from vinetrack.report.build import write_clip
 from vinetrack.video import frames as module
 from vinetrack.video.axis import MARGIN_FRAMES, Axis, event_range, read_event
 from vinetrack.video.edge import axis_of_tube, outline
-from vinetrack.video.frames import (
-    PHANTOM_TABLE,
-    Frames,
-    RecordingError,
-    inspect_recording,
-    read_frames,
-    slots_from_times,
-)
+from vinetrack.video.frames import PHANTOM_TABLE, Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.strip import Strip, camera_unit
 from vinetrack.video.track import track_frames, track_recording
@@ -503,10 +496,10 @@ def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fai
 
 def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many():
     times = np.delete(np.arange(60.0), np.arange(20, 30))
-    assert np.array_equal(slots_from_times(times)[0], np.arange(50))
-    assert np.array_equal(slots_from_times(times, known_missing=10)[0], times)
+    assert np.array_equal(module.slots_from_times(times)[0], np.arange(50))
+    assert np.array_equal(module.slots_from_times(times, known_missing=10)[0], times)
     in_milliseconds = np.round(np.delete(np.arange(71.0), np.arange(30, 51)) / 60, 3)
-    assert slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
+    assert module.slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
 
 
 def test_frames_beyond_lost_ones_are_not_used(clip):
