@@ -16,7 +16,6 @@ from hidden.balls import fallen
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
-from own_effect import NAME, write_effect
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark
@@ -29,7 +28,7 @@ from vinetrack.diagnosis.ladder import align_trials, not_better
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
-from vinetrack.effects import catalogue, own_effects
+from vinetrack.effects import catalogue
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
@@ -366,19 +365,6 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted):
     assert result.notes[-1].code == "frames_perhaps_missing"
     assert with_lost_frames(depleted, {"a": False, "b": True}).answer_set == (DROPPED_FRAMES,)
     assert with_lost_frames(depleted, {}) is depleted
-
-
-@pytest.mark.slow
-def test_a_users_own_effect_is_found_like_any_other(tmp_path):
-    own = own_effects([write_effect(tmp_path)])
-    scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "longest_frames": 420}
-    virtual = campaigns.grown(tubes()[::2], 7003, own=[tmp_path / f"{NAME}.py"], values={f"{NAME}.k": 1.5}, **scatter)
-    pairs = campaigns.pairs_of(virtual)
-    found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, NAME), ladder=False, advice=False)
-    assert found.verdict == "missing"
-    assert found.effects == (NAME,)
-    size = found.fit[f"{NAME}.k"]
-    assert abs(size.value - 1.5) < 4 * size.sigma
 
 
 def test_an_effect_that_predicts_no_condition_better_is_said_to():

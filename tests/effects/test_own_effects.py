@@ -204,10 +204,3 @@ def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect):
         singly = [float(hook(State(*(float(value * f) for value in _STATE)), _RIG, *sizes)) for f in factors]
         np.testing.assert_allclose(found, singly, rtol=1e-13)
         assert np.isfinite(float(hook(rest, _RIG, *sizes)))
-
-
-def test_effects_are_told_apart_by_name_and_file(tmp_path):
-    twin = tmp_path / "gravity.py"
-    twin.write_text((FOLDER / "gravity.py").read_text())
-    assert {load_effect(FOLDER / "gravity.py")} == {effects.gravity}
-    assert load_effect(twin) != effects.gravity

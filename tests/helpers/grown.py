@@ -15,7 +15,6 @@ from vinetrack.laboratory.campaigns import GroundTruth, VirtualTrial, campaign, 
 Pairs = list[tuple[Trial, Track]]
 FORCES = {
     "patch": "0.5 * (np.tanh((s.lead_position - 0.12) / 0.003) - np.tanh((s.lead_position - 0.15) / 0.003))",
-    "ripple": "np.sin(2 * np.pi * s.lead_position / 0.06)",
     "stribeck": "np.exp(-s.tail_velocity / 1.5)",
     "growing": "s.time / 0.2",
     "bump": "np.exp(-0.5 * ((s.lead_position - 0.08) / 0.01) ** 2)",

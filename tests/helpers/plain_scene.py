@@ -60,11 +60,9 @@ BENT = Plan(
 )  # fmt: skip
 BENDS: dict[str, dict] = {
     "quarter": {"pieces": ((120.0, 0.0), (471.2, 90.0), (90.0, 0.0))},
-    "s_shape": {"pieces": ((80.0, 0.0), (260.0, 60.0), (260.0, -60.0), (80.0, 0.0)), "from_px": (30.0, 120.0)},
     "gentle": {"pieces": ((80.0, 0.0), (480.0, 25.0)), "from_px": (30.0, 200.0)},
-    "kink": {"pieces": ((260.0, 0.0), (110.0, 70.0), (240.0, 0.0)), "from_px": (40.0, 120.0)},
 }
-"""Curves by name: a quarter circle of 300 px radius, an S of 248 px, a gentle bend of 1100 px, a sharp one of 90 px."""
+"""Curves by name: a quarter circle of 300 px radius, a gentle bend of 1100 px."""
 
 
 @dataclass(frozen=True)

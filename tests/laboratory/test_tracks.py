@@ -9,9 +9,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from by_hand import followed
-from hidden.balls import fallen
-from hidden.motion import AIR, G
 from hidden.verdicts import Answer, Should, judge
 
 from vinetrack.core.records import Trial
@@ -157,15 +154,6 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path):
     assert filmed.settings.calibration.square_mm == pytest.approx(15)
     with pytest.raises(ValueError, match="recordings already"):
         campaigns.recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
-
-
-def test_a_ball_falls_as_the_equation_of_motion_has_it():
-    mass, diameter, C_D = 2.7e-3, 0.04, 0.5
-    drag = 0.5 * AIR * math.pi * diameter**2 / 4 * C_D
-    times = np.linspace(0, 0.8, 50)
-    found = followed(lambda _t, _x, v: G - drag * v**2 / mass, 3.0)
-    assert fallen(times, mass, diameter, C_D) == pytest.approx(found(times), abs=1e-8)
-    assert np.all(fallen(np.array([-1.0, 0.0]), mass, diameter, C_D) == 0)
 
 
 LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))

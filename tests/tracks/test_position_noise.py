@@ -78,48 +78,30 @@ def test_noise_of_rounded_positions_is_not_kept_below_rounding():
     assert position_noise(np.arange(y.size) / 267, y, robust=True)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
 
 
-BLUR_S = 60e-6
 NOISE_M = 6e-5
 UNSTATED = [None] * 8
-Arrays = list[np.ndarray]
 
 
-def experiment(blur_s: float, rho: float = 0.0, seed: int = 20000) -> tuple[Arrays, Arrays, Arrays]:
-    """Times, positions and true standard deviations of fast vines, with the noise of a blurred edge."""
-    times, positions, true_sd = [], [], []
-    for i in range(8):
-        draw = np.random.default_rng(seed + i)
-        made = record(scaled(2, 10.0), draw, noise_m=NOISE_M, rho=rho)
-        blurred = blur_s * made.lead_velocity_m_s
-        times.append(made.track.time_s)
-        positions.append(made.track.lead_position_m + blurred * draw.standard_normal(blurred.size))
-        true_sd.append(np.hypot(NOISE_M, blurred))
-    return times, positions, true_sd
-
-
-def test_blur_is_found_and_so_is_the_noise_of_every_point():
-    times, positions, true_sd = experiment(BLUR_S)
-    shape = noise_shape(times, positions, UNSTATED)
-    assert shape.blur_s == pytest.approx(BLUR_S, rel=0.15)
-    ratio = np.log(np.concatenate(shape.sd_m) / np.concatenate(true_sd))
-    assert abs(np.mean(ratio)) < 0.1
-    assert np.sqrt(np.mean(ratio**2)) < 0.25
+def experiment(rho: float = 0.0, seed: int = 20000) -> list[list[np.ndarray]]:
+    """Times and positions of fast vines."""
+    made = [record(scaled(2, 10.0), np.random.default_rng(seed + i), noise_m=NOISE_M, rho=rho) for i in range(8)]
+    return [[one.track.time_s for one in made], [one.track.lead_position_m for one in made]]
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.4, 0.7])
 def test_equal_noise_is_left_equal_however_fast_the_vine_and_heavy_its_tails(rho):
     for seed in range(20100, 20160, 10):
-        times, positions, _ = experiment(0.0, rho, seed)
+        times, positions = experiment(rho, seed)
         assert noise_shape(times, positions, UNSTATED) is None
     draw = np.random.default_rng(20200)
-    times, positions, _ = experiment(0.0)
+    times, positions = experiment()
     heavy = [y + NOISE_M * draw.standard_t(4, y.size) for y in positions]
     assert noise_shape(times, heavy, UNSTATED) is None
 
 
 def test_standard_deviations_that_a_file_states_are_used_where_they_hold_and_only_there():
     draw = np.random.default_rng(20300)
-    times, positions, _ = experiment(0.0)
+    times, positions = experiment()
     stated = [np.where(draw.uniform(size=t.size) < 0.3, 3e-4, 1e-4) for t in times]
     noisier = [y + 2 * sd * draw.standard_normal(y.size) for y, sd in zip(positions, stated, strict=True)]
     shape = noise_shape(times, noisier, stated)

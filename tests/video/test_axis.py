@@ -222,14 +222,6 @@ def test_a_body_that_disappears_is_lost():
     assert not track.usable[151:].any()
 
 
-@pytest.mark.slow
-def test_body_that_leaves_the_picture_ends_the_track():
-    frames, row = falling_disc(303, n=215)
-    track = track_frames(in_memory(frames), BALL, RATE).track
-    assert "after_end" in track.flag[-1]
-    assert track.usable[(row > 90) & (row < 350)].all()
-
-
 # Axes that bend.
 RADIUS = 300.0
 

@@ -27,7 +27,7 @@ from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, SmallPictures, axis_through
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import Look, Positions, Tracker, calibrated_sigma, cut_strip, steadied
+from vinetrack.video.strip import Look, Positions, Tracker, cut_strip, steadied
 from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, moving_range, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -152,14 +152,6 @@ def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_correct
     assert np.flatnonzero(with_flag(track.flag, "gap")).tolist() == [30]
     assert np.diff(track.time_s[28:32]) == pytest.approx([1e-3, 2e-3, 1e-3])
     np.testing.assert_array_equal(correct_frames(track).time_s, track.time_s)
-
-
-def test_stated_errors_follow_the_roughness():
-    rng = np.random.default_rng(213)
-    noise = rng.normal(0, 0.5, 400)
-    position = 0.02 * np.arange(400.0) ** 2 + noise
-    scaled = calibrated_sigma(position, np.full(400, 0.2))
-    assert scaled.mean() == pytest.approx(0.5, rel=0.15)
 
 
 @pytest.mark.parametrize("flight", [2.0, 1.0])
