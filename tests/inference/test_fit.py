@@ -128,23 +128,6 @@ def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all
         assert abs(number.value - other.value) < 0.05 * other.sigma
 
 
-@pytest.mark.parametrize("is_central", [False, True])
-def test_the_column_of_a_release_is_a_difference_where_positions_are_transformed(campaign, is_central):
-    fit = campaign[0]
-    found = vt.refit(fit, fit.model + "length_scale", start={"length_scale.eps": 0.01}, most_iterations=1)
-    predictor, state = found.predictor, found.solution.state
-    predictor.is_central = is_central
-    assert not predictor.release_is_shift.any()
-    columns = predictor.linearise(state.theta, state.trial_effects)
-    moved = state.trial_effects.copy()
-    moved[:, 0] += 1e-3 * predictor.frames_s
-    residuals = (predictor.residuals(state.theta, own) for own in (state.trial_effects, moved))
-    before, after = (np.split(of_all, predictor.starts[1:-1]) for of_all in residuals)
-    for of_trial, one, other, frame_s in zip(columns, before, after, predictor.frames_s, strict=True):
-        slope = (one - other) / (1e-3 * frame_s)
-        assert np.median(np.abs(of_trial[:, 0] - slope)) < 0.02 * np.max(np.abs(slope))
-
-
 def test_central_differences_keep_apart_what_acts_in_the_same_way(campaign):
     """Pressure and yield pressure act by their difference alone: one-sided differences miss that by a thousandth, which
     is ten times the noise of a precise track, and promised gains that no step could keep.
@@ -260,18 +243,6 @@ def test_a_vine_that_ends_short_of_its_stated_length_is_no_misfit():
     assert fit.chi2_per_dof < 1.3
 
 
-def test_a_measured_pressure_replaces_the_set_pressure():
-    pairs, draw = [], np.random.default_rng(2)
-    for P in (14, 20, 28, 36):
-        trial = replace(vine_trial(f"t{P}", P), vine="v")
-        track = filmed(trial, draw, pressure=1.1)[0]
-        pairs.append((trial, replace(track, pressure_Pa=np.full(track.time_s.size, 1.1e3 * P))))
-    fit = vt.fit(vt.base_model(), pairs)
-    assert "pressure" not in fit.spreads
-    assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma
-    assert fit["B"].value == pytest.approx(B_TRUE[24.0], rel=0.1)
-
-
 def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one():
     trial = replace(vine_trial("one", 22), vine="v")
     fit = vt.fit(vt.base_model(), [(trial, filmed(trial, np.random.default_rng(4))[0])], fixed=("n",))
@@ -353,6 +324,7 @@ def test_the_yield_pressure_is_estimated_instead_of_a_release():
     # Released where it is seen to start, any lower yield pressure fits about as well; let in, only the true one does.
     fit = vt.fit(vt.base_model(), slow_campaign())
     assert all(abs(trial.release_s) < 1e-3 for trial in fit.trials)
+    assert "pressure" not in fit.spreads  # a measured one takes the place of the set one
     assert abs(fit["P_y"].value - P_Y_TRUE) < max(4 * fit["P_y"].sigma, 20.0)
     assert abs(fit["n"].value - N_SLOW) < max(4 * fit["n"].sigma, 0.01)
     for trial in fit.trials:
@@ -577,12 +549,8 @@ def test_the_same_numbers_are_reached_from_any_initial_release(only_in_motion, e
     assert np.abs(moved / [number.sigma for number in only_in_motion.numbers]).max() < 0.1
 
 
-def test_a_fit_converges_from_its_own_solution(only_in_motion):
-    """And one whose trajectories overflow costs infinitely much, without a warning."""
+def test_a_fit_whose_trajectories_overflow_costs_infinitely_much_without_a_warning(only_in_motion):
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-3)
-    assert found.converged
-    assert found.iterations <= 3
     far = np.full(predictor.first.size, 1e200)
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
     assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()
