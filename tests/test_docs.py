@@ -1,14 +1,16 @@
-"""Pages and docstrings: links lead somewhere, commands exist and print what is shown, examples run."""
+"""Pages, docstrings, lock and profiles: links lead somewhere, commands exist and print what is shown, examples run."""
 
 import doctest
 import importlib
 import json
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
 import typer.main
+import yaml
 from commanded import Shown, pieces, printed, run, succeed
 from hand_sheet import one_vine
 from own_effect import PAGE as OWN_EFFECT
@@ -153,3 +155,32 @@ def test_the_examples_of_a_module_say_what_happens(name):
     for test in doctest.DocTestFinder().find(importlib.import_module(name), name):
         runner.run(test, out=said.append)
     assert not said, "".join(said)
+
+
+# The lock, the file for hosted machines and the profiles of Snakemake name what is here.
+def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_no_path():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+    def locked(lock: str) -> set[str]:
+        return set(re.findall(r"^([a-z0-9][a-z0-9._-]*)==", lock, flags=re.MULTILINE))
+
+    lock, docs = ((ROOT / f"requirements{which}.lock").read_text(encoding="utf-8") for which in ("", "-docs"))
+    wanted = [one for part in (project["dependencies"], *project["optional-dependencies"].values()) for one in part]
+    names = {re.split(r"[<>=!~\[; ]", requirement)[0].lower().replace("_", "-") for requirement in wanted}
+    assert names - locked(lock) - locked(docs) == set()
+    entries = re.split(r"^(?=[a-z0-9])", lock, flags=re.MULTILINE)[1:]
+    assert len(entries) == len(locked(lock)) > 80
+    assert all("--hash=sha256:" in entry for entry in entries)
+    assert not re.search(r"https?://|file:|^--|^-[a-z]|/", lock + docs, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("profile", ["default", "slurm"])
+def test_profiles_hold_options_that_snakemake_knows_and_rules_that_are_there(profile):
+    from snakemake.cli import get_argument_parser
+
+    if profile == "slurm":
+        pytest.importorskip("snakemake_executor_plugin_slurm")
+    known = {word.lstrip("-") for action in get_argument_parser()._actions for word in action.option_strings}
+    settings = yaml.safe_load((ROOT / "profiles" / profile / "config.yaml").read_text(encoding="utf-8"))
+    assert set(settings) <= known
+    assert set(settings.get("set-resources", ())) <= set(STAGES)

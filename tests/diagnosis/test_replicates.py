@@ -7,7 +7,7 @@ import pytest
 from lsoda_vine import B_TRUE, as_track, filmed, grown_position, vine_trial
 
 import vinetrack as vt
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis import diagnose as diagnosing
 from vinetrack.diagnosis.diagnose import diagnose, implied_pressure_Pa, odd_trials
 from vinetrack.diagnosis.ladder import compare, position_errors, replicates_of
@@ -15,30 +15,21 @@ from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
-
-
-def trial_fit(name: str, time_s: Floats, position_m: Floats, speed_m_s, release_s, origin_m) -> TrialFit:
-    since_s = np.maximum(time_s - release_s, 0.0)
-    model_m = origin_m + speed_m_s * since_s
-    off_m = position_m - model_m
-    nothing = ("release_sigma_s", "origin_sigma_m", "pressure_deviation", "pressure_deviation_sigma",
-               "damping_deviation", "damping_deviation_sigma")  # fmt: skip
-    return TrialFit(
-        trial=Trial(name=name, vine="v", condition="c"), time_s=time_s, lead_position_m=position_m,
-        predicted_position_m=model_m, predicted_velocity_m_s=speed_m_s * (since_s > 1e-9), residual_m=off_m,
-        whitened=off_m, release_s=release_s, origin_m=origin_m, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
-    )  # fmt: skip
-
-
 SPEED_M_S = 2.0
 
 
 def by_hand(name: str, misfit_m: np.ndarray | float, rest: int = 20, end_s: float = 0.1) -> TrialFit:
     """A trial that rests and then runs at 2 m/s in the model; its measurement is off by `misfit_m` once it moves."""
     time_s = STEP_S * np.arange(-rest, round(end_s / STEP_S) + 1)
-    position_m = 0.3 + SPEED_M_S * np.maximum(time_s, 0.0)
-    position_m[rest + 1 :] += misfit_m
-    return trial_fit(name, time_s, position_m, SPEED_M_S, 0.0, 0.3)
+    model_m, off_m = 0.3 + SPEED_M_S * np.maximum(time_s, 0.0), np.zeros(time_s.size)
+    off_m[rest + 1 :] = misfit_m
+    nothing = ("release_s", "release_sigma_s", "origin_sigma_m", "pressure_deviation", "pressure_deviation_sigma",
+               "damping_deviation", "damping_deviation_sigma")  # fmt: skip
+    return TrialFit(
+        trial=Trial(name=name, vine="v", condition="c"), time_s=time_s, lead_position_m=model_m + off_m,
+        predicted_position_m=model_m, predicted_velocity_m_s=SPEED_M_S * (time_s > 1e-9), residual_m=off_m,
+        whitened=off_m, origin_m=0.3, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
+    )  # fmt: skip
 
 
 def errors_of(*trials: TrialFit) -> dict[str, float]:
