@@ -46,7 +46,7 @@ def campaign(draw, vines=tuple(B), pressures=10, trials=4, B_scatter=0.0, P_scat
                     "thickness_um": 50.0 * scale, "x_ss_m_s": measured, "x_ss_sigma_m_s": 0.002 * measured,
                     "force_N": (P - 3e3) * area, "force_sigma_N": 0.01 * P * area, "yield_force_sigma_N": 200 * area,
                     "used": True, "eligible": True, "reason": "", "condition": "c", "x_ss_paper_m_s": measured,
-                    "force_paper_N": (P - 3e3) * area
+                    "force_paper_N": (P - 3e3) * area,
                 }
             )  # fmt: skip
     return pd.DataFrame(rows)

@@ -38,19 +38,13 @@ def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of
 NAMES = {
     "d12_24kPa_1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"},
     "D12 24KPA run 3.mov": {"diameter_mm": "12", "pressure_kPa": "24"},
-    "24mm-200um-280mm_30.5kPa_20g.mp4": {
-        "diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30.5", "payload_g": "20",
-    },
+    "24mm-200um-280mm_30.5kPa_20g.mp4": {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280",
+                                         "pressure_kPa": "30.5", "payload_g": "20"},
     "d0p5in_4psi.mp4": {"diameter_in": "0.5", "pressure_psi": "4"},
-    "p36_m20_l280_t100_2.avi": {
-        "pressure_kPa": "36", "payload_g": "20", "length_mm": "280", "thickness_um": "100",
-    },
+    "p36_m20_l280_t100_2.avi": {"pressure_kPa": "36", "payload_g": "20", "length_mm": "280", "thickness_um": "100"},
     "l28cm 1000fps.mp4": {"length_cm": "28", "capture_fps": "1000"},
-    "d12/24kPa/1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"},
-    "d12/d24_1.mp4": {"diameter_mm": "24"},
-    "GX010042.mp4": {},
-    "p24kPa_t1.mp4": {"pressure_kPa": "24"},
-    "2024-05-01 17.22.mp4": {},
+    "d12/24kPa/1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"}, "d12/d24_1.mp4": {"diameter_mm": "24"},
+    "GX010042.mp4": {}, "p24kPa_t1.mp4": {"pressure_kPa": "24"}, "2024-05-01 17.22.mp4": {},
     "day3_tube2.mp4": {"day": "3", "specimen": "2"},
 }  # fmt: skip
 

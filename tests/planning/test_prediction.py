@@ -89,11 +89,7 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     drawn_Pa = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
     alone = [certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3) for P_y in drawn_Pa]
     speeds = [vt.predict_vine(one, samples=1).quantities[0].median for one in alone]
-    assert [
-        prediction[EDGE].high,
-        prediction[EDGE].median,
-        prediction[EDGE].low,
-    ] == pytest.approx(speeds, rel=2e-3)
+    assert [prediction[EDGE].high, prediction[EDGE].median, prediction[EDGE].low] == pytest.approx(speeds, rel=2e-3)
     (share,) = prediction.shares
     assert (share.low, share.high) == pytest.approx((prediction[EDGE].low, prediction[EDGE].high), rel=0.03)
 
