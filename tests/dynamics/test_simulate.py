@@ -6,17 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from by_hand import ATM, BARE, LOADED, RT_AIR, G, N, followed
-from own_effect import NAME, write_effect
 from scipy.integrate import solve_ivp
 
 import vinetrack as vt
 from vinetrack import effects
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics import simulate as batch
-from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, evaluate, motion_since
-from vinetrack.dynamics.model import check_needs, effects_on, host_for, shared_host, stated
+from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, motion_since
+from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
-from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue, load_effect, own_effects
+from vinetrack.effects import BASE_EFFECTS, EffectError, catalogue
 
 SLOWER = LOADED.trial(pressure_Pa=14e3)
 VINE = replace(SLOWER, payload_kg=0.0)
@@ -202,16 +201,6 @@ def test_removing_by_effect_or_by_name_removes_its_values():
             twice()
 
 
-@pytest.mark.parametrize("column", ["bends", "day", "chamber_l"])
-def test_a_column_that_an_effect_needs_is_blank_without_bends_text_or_number(column):
-    blank, needy = replace(BALL, travel_ratio=2.0), replace(catalogue()[BASE_EFFECTS[-1]], needs=(column,))
-    model = vt.make_model(BASE_EFFECTS[:-1]) + needy
-    assert not stated(column, blank)
-    with pytest.raises(EffectError):
-        check_needs(model, blank)
-    check_needs(model, replace(blank, bends=(Bend(0.1, 0.1, 0.05),), day="1", chamber_m3=1e-3))
-
-
 def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
     assert vt.base_model().parameter_names == ("gravity.g", "eversion_damping.B", "eversion_damping.n")
     assert vt.base_model().parameters_for("any").tolist() == [9.81, 3.0, 0.37]
@@ -220,35 +209,6 @@ def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
     assert model.parameters_for("thick").tolist() == [9.81, 4.0, 0.5]
     with pytest.raises(EffectError):
         model.parameters_for("other")
-
-
-def test_effects_of_size_zero_and_replaced_ones_do_not_act():
-    model = vt.base_model() + effects.reservoir_depletion + effects.supply_refill + effects.air_drag
-    rows = np.array([model.parameters_for(""), model.with_values({"air_drag.C_D": 0.0}).parameters_for("")])
-    acting = dict(zip(model.names, effects_on(model, rows).T.tolist(), strict=True))
-    always = {name: [True, True] for name in (*BASE_EFFECTS, "supply_refill")}
-    assert acting == {**always, "air_drag": [True, False], "reservoir_depletion": [False, False]}
-
-
-def test_terms_along_a_motion_by_hand():
-    model = vt.base_model().with_values({"eversion_damping.B": 6.44})
-    terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
-    mass = 1200 * math.pi * 0.024 * 200e-6 * (0.28 - 0.1) + 0.0356
-    area = math.pi * 0.012**2
-    tip = {"pressure_drive": 28e3 * area, "eversion_damping": -6.44 * 4**0.37, "yield_pressure": -3e3 * area}
-    assert terms.state.moving_mass[0] == pytest.approx(mass, rel=1e-12)
-    assert {name: force[0] for name, force in terms.tip_N.items()} == pytest.approx(tip, rel=1e-12)
-    assert terms.tension_N[0] == pytest.approx(sum(tip.values()) / 2, rel=1e-12)
-    assert terms.acceleration_m_s2[0] == pytest.approx((sum(tip.values()) / 2 + mass * 9.81) / mass, rel=1e-12)
-
-
-def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp_path):
-    own = own_effects([write_effect(tmp_path)])
-    named_as_another = load_effect(write_effect(tmp_path).rename(tmp_path / "air_drag.py"))
-    assert named_as_another.name in catalogue()
-    models = (vt.base_model(), vt.make_model(["gravity"]), vt.base_model() + "air_drag" + own[NAME])
-    for several in (*(model.effects for model in models), (*vt.base_model().effects, named_as_another)):
-        assert shared_host(several) is None
 
 
 def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):

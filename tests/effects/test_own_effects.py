@@ -13,8 +13,8 @@ from commanded import run
 import vinetrack as vt
 import vinetrack.effects as effects
 from vinetrack.dynamics.simulate import kernel
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, State, air_drag, catalogue, find_effect, load_effect
-from vinetrack.effects._catalogue import _RIG, _STATE, behaviour_faults, own_effects
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, air_drag, catalogue, find_effect, load_effect
+from vinetrack.effects._catalogue import behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
 
@@ -123,12 +123,6 @@ def test_the_command_lists_it_with_the_effects_of_the_catalogue(tmp_path):
     assert run("effects", "--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
 
 
-def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path):
-    first = load_effect(written(tmp_path))
-    second = load_effect(written(tmp_path, BRUSH.replace("0.8, bounds", "0.9, bounds")))
-    assert (first.parameters[0].default, second.parameters[0].default) == (0.8, 0.9)
-
-
 @pytest.fixture
 def effect_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
@@ -191,16 +185,3 @@ def test_a_file_names_describes_and_works_out_its_effect_and_bounds_its_paramete
         assert low <= parameter.default <= high
         assert parameter.shared in ("all", "vine", "day")
         assert low <= parameter.plausible[0] < parameter.plausible[1] <= high
-
-
-@each_effect
-def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect):
-    sizes = [parameter.default for parameter in effect.parameters]
-    factors = np.array([0.5, 1.0, 1.7])
-    rows = State(*(np.asarray(value * factors) for value in _STATE))
-    rest = _STATE._replace(time=0.0, lead_position=0.0, lead_velocity=0.0, tail_position=0.0, tail_velocity=0.0)
-    for hook in effect.functions.values():
-        found = np.broadcast_to(np.asarray(hook(rows, _RIG, *sizes)), factors.shape)
-        singly = [float(hook(State(*(float(value * f) for value in _STATE)), _RIG, *sizes)) for f in factors]
-        np.testing.assert_allclose(found, singly, rtol=1e-13)
-        assert np.isfinite(float(hook(rest, _RIG, *sizes)))

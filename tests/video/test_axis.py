@@ -356,15 +356,6 @@ def test_a_straight_vine_keeps_the_straight_axis_it_had(changes):
     assert curves.find_growth_axis(small) == find_axis(small)
 
 
-@pytest.mark.parametrize(("share", "width_px", "bends"), [(0.65, 30.0, True), (0.9, 48.0, False)])
-def test_a_curve_is_the_axis_where_it_explains_more_in_a_band_of_one_width(monkeypatch, share, width_px, bends):
-    found = {"find_axis": Axis((20.0, 30.0), (220.0, 30.0), 40.0), "find_curve": replace(quarter(), width_px=width_px)}
-    for name, axis in found.items():
-        monkeypatch.setattr(curves, name, lambda _, axis=axis: axis)
-    monkeypatch.setattr(curves, "front_share", lambda _, axis, **__: share if axis.bends else 0.65)
-    assert curves.find_growth_axis(None).bends is bends
-
-
 @pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])
 def test_a_band_hardly_longer_than_wide_has_no_curve(length_px, width_px):
     rng = np.random.default_rng(2211)

@@ -23,11 +23,10 @@ from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
 from vinetrack.report.build import write_clip
 from vinetrack.video import frames as module
-from vinetrack.video.axis import MARGIN_FRAMES, Axis, event_range, read_event
-from vinetrack.video.edge import axis_of_tube, outline
+from vinetrack.video.axis import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.frames import PHANTOM_TABLE, Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.strip import Strip, camera_unit
+from vinetrack.video.strip import camera_unit
 from vinetrack.video.track import track_frames, track_recording
 
 RNG = np.random.default_rng(5)
@@ -509,17 +508,6 @@ def test_frames_beyond_lost_ones_are_not_used(clip):
     assert not track.usable[48:].any()
     error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]
     assert np.max(np.abs(error - np.median(error))) < 1e-3
-
-
-def test_a_tube_of_two_widths_has_one_of_them():
-    n, rows, columns = 60, 81, 240
-    values = np.random.default_rng(6).normal(60, 2, (n, rows, columns))
-    inside = np.abs(np.arange(rows) - rows // 2)[:, None] <= np.where(np.arange(columns) < 120, 8, 30)
-    for i in range(n):
-        values[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & inside)
-    luma, axis = np.clip(values, 0, 255).astype(np.uint8), Axis((0, 40), (columns - 1, 40), 40)
-    sides = outline(Strip(luma, np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False), 12)
-    assert np.isfinite([sides.width_px, *axis_of_tube(axis, sides)[0].to_px]).all()
 
 
 GIVEN_UP = """
