@@ -593,14 +593,6 @@ def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_pat
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
 
 
-def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path):
-    header, a, b = GOOD.splitlines()
-    more = a.replace("a,a", "c,a"), b.replace("b,b.csv,24", "d,b.csv,30")
-    sheet = f"{header},use\n{a},\n{b},\n{more[0]},\n{more[1]},no\n"
-    trials = planned_sheet(write(two_vines(tmp_path), sheet)).trials
-    assert [trial.name for trial in trials] == ["a", "b"]
-
-
 def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_path):
     folder = write(two_vines(tmp_path), GOOD, "chamber_l: 2\nmodel: [pressure_drive, gravity, leak]\n")
     planned = planned_sheet(folder)

@@ -276,17 +276,6 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path):
         assert np.sort(away, axis=0)[:8].mean(axis=0).argmin() == pytest.approx(place, abs=2), colour
 
 
-def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_they_were_fitted(tmp_path):
-    for diagnosed in (False, True):
-        results = Results(campaign(tmp_path / str(diagnosed), diagnosed)[1])
-        if diagnosed:
-            pd.read_csv(results.predictions("a")).iloc[5:40].to_csv(results.predictions("a"), index=False)
-        edges, release_s = clips.edges_to_draw("a", results, read_result(results.track("a")))
-        assert [edge.name for edge in edges][: None if not diagnosed else 1] == ["tracked edge"]
-        assert release_s == pytest.approx(0.020 if diagnosed else 0.021)
-    assert np.flatnonzero(np.isfinite(edges[1].along_px)).tolist() == list(range(5, 40))
-
-
 def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
     _, results = campaign(tmp_path)
     drawn: list[np.ndarray] = []
