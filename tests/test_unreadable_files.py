@@ -154,7 +154,6 @@ def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path):
 
 @pytest.mark.parametrize("name", ["trials.csv", "experiment.yaml", "corrections.csv", "b.csv"])
 def test_a_link_whose_disk_is_not_there_is_said_and_not_taken_for_a_file_left_out(tmp_path, name):
-    """Settings on a disk that is not connected would otherwise be the defaults."""
     path = two_vines(tmp_path) / name
     path.unlink(missing_ok=True)
     path.symlink_to(tmp_path / "disk" / name)

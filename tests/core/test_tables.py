@@ -53,7 +53,6 @@ def test_every_dialect_reads_to_the_same_rows(tmp_path, data):
 
 
 def test_cells_and_lines_stay_where_they_are(tmp_path):
-    """Lines of the file are counted; what is missing is blank, and what is beyond is kept."""
     assert table_of(tmp_path, "trial,Größe\na,µ\n".encode("cp1252")).rows == ({"trial": "a", "Größe": "µ"},)
     assert parse_table('a,b\n\n1,2\n,\n"x\ny",3\n4,5\n').lines == (3, 5, 7)
     table = parse_table("a,b\n1\n1,2,3,\n")
@@ -93,7 +92,6 @@ def test_numbers_and_what_is_none():
 
 
 def test_thousands_and_decimals_are_not_guessed():
-    """1,069 fps read as 1.069 would be wrong by a factor of a thousand, in silence."""
     with pytest.raises(InputError, match=r"write 1\.0690 or 1069"):
         parse_number("1,069")
     with pytest.raises(InputError, match=r"write 1\.0690 or 1069"):
@@ -109,7 +107,6 @@ def test_thousands_and_decimals_are_not_guessed():
 
 
 def test_paths_inside(tmp_path):
-    """A link inside the folder may point out of it."""
     for relative in ("videos/a.mp4", r"videos\a.mp4", "./videos//a.mp4", "x/../videos/a.mp4", " videos/a.mp4 "):
         assert safe_join(Path("exp"), relative) == Path("exp/videos/a.mp4")
     assert safe_join(Path("exp"), "at 3.04\u202fPM.mov") == Path("exp/at 3.04\u202fPM.mov")  # as macOS names them

@@ -131,7 +131,6 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
     ],
 )
 def test_what_fits_worse_is_excluded_and_a_larger_form_that_fits_no_better(given, kept):
-    """By ln L and inflation."""
     ratios = []
     for name, (log_likelihood, inflation) in given.items():
         known = SimpleNamespace(log_likelihood=log_likelihood), 0.0, 0.0, True, Remark()
@@ -166,7 +165,6 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day_and_known_to
 
 @pytest.mark.slow
 def test_a_chamber_that_was_misread_is_a_depletion(tmp_path):
-    """With a γ that no gas has, and nothing else."""
     rivals = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
     said = diagnosed(laboratory(tmp_path, "chamber_smaller", 902, (10, 14), weighed=False)[1], rivals)
     assert (said.effects, said.final_verdict) == (("reservoir_depletion",), "adequate")
@@ -379,7 +377,6 @@ def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
 def test_the_drag_of_falling_balls_is_named(model):
-    """And nothing that only a tube can have."""
     balls, time_s = [], np.arange(100) / 120
     for kind, size in enumerate(((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))):
         for repeat in range(3):

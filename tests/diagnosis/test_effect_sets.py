@@ -92,7 +92,6 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
 
 
 def test_a_set_that_ends_higher_from_a_larger_one_is_tested_again(monkeypatch):
-    """Capstan friction alone had ended in a local minimum, and was named with a second effect."""
     search = sets_of([of(NAMES[:1], -100.0)])
     search.grow = lambda _: search._keep_best(of(NAMES[1:2], -50.0)) or [of(NAMES[:2], -49.0)]
     told = {"adequate_hypotheses": lambda known, _: (known[:1], {}, "after"), "_rounds": lambda *told: told[2]}
@@ -178,7 +177,6 @@ def test_three_effects_are_found_one_after_the_other(three_missing):
     [(970.0, [("artefact", "lens")]), (930.0, [("missing", "latch_release"), ("artefact", "lens")])],
 )
 def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like(monkeypatch, gained, named):
-    """Measured: a lens with a fifth order was `latch_release`, with a lens beside it."""
     latch, lens = SimpleNamespace(name="latch_release", kind=""), SimpleNamespace(name="lens", kind="measurement")
     singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
     pair = SimpleNamespace(names=("latch_release", "lens"), effects=(latch, lens), delta_chi2=1000.0, fit=None)

@@ -98,7 +98,6 @@ def test_an_adequate_model_is_off_by_as_much_as_the_scatter_of_trials_makes_expe
 
 
 def test_an_error_of_the_lens_which_trials_share_has_the_freedom_of_its_four_polynomials(pairs):
-    """It was counted as noise of every point, so that the range of an adequate model's error was far too narrow."""
     course = ladder_module.ResidualCourse(pairs[0][0], np.zeros(99), np.zeros((99, 2)), np.zeros(99), 1e-14, 1e-8)
     mean_m2, degrees, _ = ladder_module.mean_square([course] * 6, ladder_module.Scatter(1.0, 5))
     assert (mean_m2, degrees) == pytest.approx((1e-8, 4.0), rel=1e-4)
@@ -189,10 +188,7 @@ def test_every_trial_finds_the_b_it_was_grown_with():
 
 @pytest.mark.slow
 def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_large_as_replicates_make_them():
-    """In the third campaign the noise remembers itself, in the fourth trials scatter little.
-
-    With the smaller error of a thousand independent frames mean residuals would stray by 20 of them.
-    """
+    """In the third campaign the noise remembers itself, in the fourth trials scatter little."""
     nuisances = [{}, {}, {"noise_correlation": 0.6}, {"damping_scatter": 0.005, "pressure_scatter": 0.002}]
     fits = [fitted(pairs_of(grown(sheet(), 72 + k, **more))) for k, more in enumerate(nuisances)]
     for found in map(drift, fits):

@@ -254,7 +254,6 @@ def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(d
 
 @pytest.mark.slow
 def test_a_promise_allows_for_what_the_lens_may_absorb():
-    """With the tail on a reel and one pressure: without it 13.4 standard deviations were promised, and 9 came."""
     tube, truth = campaign(Vine(24.0, 200.0, 280.0), (28,), 8), ("reservoir_depletion.gamma", 1.4)
     trials = with_names([replace(one, chamber_m3=3.7e-3, inlet_m=8e-3, tail_store="reel") for one in tube])
     pairs = grown(list(trials), 6000, 1.0, *truth)

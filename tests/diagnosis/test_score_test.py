@@ -68,7 +68,6 @@ def test_a_size_explains_its_own_part_of_how_trials_scatter():
     ],
 )
 def test_candidates_are_false_alarms_as_seldom_as_they_say(seed, trials, scatter, named, level, campaigns, most):
-    """Of one shape each, or one of twenty beside one."""
     draw = np.random.default_rng(seed)
     asked = [questioned(scores(draw, trials, len(named), scatter), level, named) for _ in range(campaigns)]
     assert sum(each.any_exceeds(level) for each in asked) <= most
@@ -102,7 +101,6 @@ def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels(
 
 
 def test_what_one_of_many_probes_feels_alone_is_heard():
-    """Six standard errors in one of 24 probes."""
     draw, sizes = np.random.default_rng(20606), np.array([6.0, *[0] * 23]) / math.sqrt(60)
     heard = [any_probe_exceeds(scores(draw, 60, 24, sizes=sizes), misfit_tests.PROBE_LEVEL) for _ in range(60)]
     assert np.mean(heard) > 0.6
@@ -256,7 +254,6 @@ def test_an_implausible_size_is_believed_where_no_other_is_plausible():
 
 
 def test_an_implausible_size_is_not_believed_where_one_beyond_belief_fits_better():
-    """A gas of 2.5 times its density was named for a drag that was ten times the largest known."""
     far, tests = replace(hypothesis("air_drag", -100.0), plausible=False), SimpleNamespace(rejects_model=False, fit=1)
     for log_likelihood, code, named in ((-99.0, "", []), (-101.0, "", ["air_drag"]), (-101.0, "implausible_size", [])):
         search = SimpleNamespace(tests_after=lambda _: tests, implausible=lambda _, code=code: Remark(code))
@@ -281,7 +278,6 @@ def test_an_effect_is_fitted_from_its_usual_values_too_and_never_twice_from_the_
 
 @pytest.mark.parametrize(("within", "code"), [(-103.0, ""), (-106.0, "implausible_size"), (None, "implausible_size")])
 def test_a_wide_error_makes_no_size_plausible_that_fits_far_worse_within_its_range(monkeypatch, within, code):
-    """A lens with a length scale, each of a size that no camera has, was named for a slipping tail."""
     far = replace(hypothesis("air_drag", -100.0), fit=known_fit(-100.0, number_of("air_drag.C_D", 6.0, 4.0)))
     bounds = []
 
@@ -312,7 +308,6 @@ def test_positions_with_independent_noise_are_no_averages(correlation, code):
 
 
 def test_a_set_is_worth_what_it_has_more_than_the_best_one_within_it(monkeypatch):
-    """Depletion and drag were held against a refill so slow that it is a depletion as two sizes more."""
     search = selection.Search(SimpleNamespace(fit=known_fit(-200.0)), str)
     monkeypatch.setattr(search, "tests_after", lambda _: SimpleNamespace(family=dict.fromkeys(catalogue(), 4.9)))
     for gained, *names in ((100.2, "supply_refill"), (100.0, "reservoir_depletion"), (60.0, "air_drag")):

@@ -185,7 +185,6 @@ def test_a_video_needs_its_rate_of_capture_but_dng_frames_carry_their_own(folder
 
 
 def test_a_rate_of_playback_is_suspected(folder):
-    """30 fps is legal, but nobody films a vine at it."""
     for file, settings, cell in (("experiment.yaml", "capture_fps: 30\n", ""), ("trials.csv", "", "30")):
         experiment = one(folder, settings, track=None, video="a.mp4", capture_fps=cell)
         assert [trial.capture_fps for trial in experiment.trials] == [30]
@@ -609,7 +608,6 @@ def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_
 
 
 def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tmp_path):
-    """A payload under a wrong name would else be taken for none."""
     text = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\na,24,200,280,28,35.6\n"
     (tmp_path / "ideas.csv").write_text(text, encoding="utf-8")
     planned = planned_sheet(tmp_path / "ideas.csv")

@@ -129,9 +129,7 @@ def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all
 
 
 def test_central_differences_keep_apart_what_acts_in_the_same_way(campaign):
-    """Pressure and yield pressure act by their difference alone: one-sided differences miss that by a thousandth, which
-    is ten times the noise of a precise track, and promised gains that no step could keep.
-    """
+    """Pressure and yield pressure act by their difference alone: one-sided differences miss that by a thousandth."""
     fit = campaign[0]
     predictor, state = fit.predictor, fit.solution.state
     key, free = predictor.layout.keys.index("yield_pressure.P_y"), predictor.layout.free
@@ -173,7 +171,6 @@ def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign):
 
 
 def test_an_interval_near_a_bound_holds_a_parameter_that_lies_there():
-    """Intervals by profile likelihood began at the estimate: they knew of no errors but noise."""
     pairs = [(replace(t, position_systematic_m=1e-3), track) for t, track in small_campaign(seed=5, replicates=2)[0]]
     mu = vt.fit(vt.base_model() + vt.effects.tail_friction, pairs)["mu_w"]
     assert mu.low == mu.lower == 0.0 < mu.value < mu.sigma
@@ -432,8 +429,6 @@ def test_a_rest_counts_as_one_point_where_rounding_hides_its_noise():
 
 
 def test_an_error_that_the_pictures_of_a_rest_share_moves_nothing():
-    """Pictures of one edge. As points with noise of their own they moved n by 1.3 σ."""
-
     def fit_with_rests_off_by(error_m):
         pairs = []
         for trial, track in small_campaign(21, rho=0.3)[0]:
@@ -468,7 +463,6 @@ def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_trave
 
 @pytest.mark.slow
 def test_origins_of_rounded_tracks_have_the_stated_errors():
-    """Taken for independent values, twenty equal ones at rest gave origins that were off by five standard errors."""
     errors = []
     for seed in (2, 3):
         pairs, truth = rounded(seed)

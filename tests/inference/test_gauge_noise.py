@@ -64,7 +64,6 @@ def emptied(seed: int, noise_Pa: float = 50.0, beyond: int = 0) -> tuple[np.ndar
 
 @pytest.mark.parametrize("offset", [12.4, -7.8])
 def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset):
-    """Read every eighth frame."""
     traces, growths, read_at = [], [], np.arange(0, FRAMES.size + 8, 8)
     for seed in range(12):
         pressure_Pa, _, growth_m = emptied(seed)
@@ -219,7 +218,6 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
 
 
 def test_noise_that_lasts_for_many_samples_leaves_no_waves():
-    """Its correlation is estimated as 0.78 for 0.85: more than half of its slow part would then be pressure."""
     draw, tracks = np.random.default_rng(26), []
     for count in range(100, 800, 20):
         pressure_Pa = 8e3 + ar1_noise(count, 100.0, 0.85, draw)
@@ -312,7 +310,6 @@ def test_an_error_of_a_trace_is_estimated(fit):
 
 
 def test_trace_errors_suggest_no_exponent_per_vine(fit):
-    """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
     apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
 

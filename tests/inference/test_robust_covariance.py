@@ -67,10 +67,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
 
 @pytest.mark.slow
 def test_no_error_is_smaller_than_the_scatter_of_trials_implies():
-    """Of bent pictures the trials scatter 1.6 times as widely in one number as the noise says.
-
-    What trials err by together, which here is more, is left aside.
-    """
+    """Of bent pictures the trials scatter 1.6 times as widely in one number as the noise says."""
     found = vt.fit(vt.base_model(), unlike(20620))
     covariance, robust, _ = errors.robust_variances(found.predictor, found.solution)
     plain = np.diag(covariance)
@@ -187,7 +184,6 @@ def test_the_band_of_drops_that_agree_is_their_noise():
 
 
 def test_a_trial_that_depends_on_what_the_fit_does_not_determine_has_no_band():
-    """Friction of a payload, fitted to bare vines: a band would take what it stays at for known exactly."""
     pairs, draw = small_campaign(4)[0], np.random.default_rng(4)
     fit = vt.fit(vt.base_model() + "payload_friction", pairs)
     loaded = replace(pairs[0][0], name="loaded", payload_kg=0.06)

@@ -228,10 +228,7 @@ def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_stea
 
 @pytest.mark.slow
 def test_b_and_n_come_home_with_the_pressure_of_the_model():
-    """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way.
-
-    With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong.
-    """
+    """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way."""
     trials = of_vine(isometric_vine(1), (15.1, 22.8, 30.5, 38.3, 46, 53.7), 3, prefix="R1_")
     trials += of_vine(isometric_vine(2), (12.7, 18.5, 24.3, 30.1, 35.9, 41.7), 3, prefix="R2_")
     trials = list(with_names([replace(trial, chamber_m3=2.5e-4) for trial in trials]))

@@ -55,7 +55,6 @@ def test_speed_is_the_true_mean_and_the_speed_of_balance(vine, noise_m, rho):
 @pytest.mark.parametrize("end_frames", [0, 1, 60])
 @pytest.mark.parametrize("vine", [scaled(1, 1.0), scaled(2, 5.0), scaled(4, 3.0)], ids=str)
 def test_the_end_of_growth_is_not_in_the_window(vine, end_frames):
-    """Seen in the recording, or known by the vine's length."""
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         trial = record(vine, rng, noise_m=3e-5, rest_frames=40, end_frames=end_frames)

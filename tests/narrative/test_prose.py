@@ -31,7 +31,6 @@ CUT = re.compile(
 
 
 def test_no_module_outside_the_room_of_prose_parses_it():
-    """`row.reason.startswith("…")`, `str(error.reason).partition("…")`, `"…" in note`."""
     assert [(path.name, found) for path in FILES for found in CUT.findall(path.read_text(encoding="utf-8"))] == []
 
 
@@ -45,7 +44,6 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code():
 
 
 def test_no_sentence_is_cut_at_a_comma():
-    """One about trials that contradict the others was."""
     with (PACKAGE / "narrative" / "sentences.csv").open(encoding="utf-8", newline="") as file:
         assert {len(row) for row in csv.reader(file)} == {2}
 

@@ -179,7 +179,6 @@ def test_a_failed_simulation_is_reported_and_curves_stay(browser, monkeypatch):
 
 
 def test_a_torn_recording_is_named(browser, monkeypatch, tmp_path):
-    """Also once the text of the page was updated."""
     (tmp_path / "torn.mp4").write_bytes(b"not a film")
     view = RecordingView(tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, pd.DataFrame(), np.zeros(0))
     monkeypatch.setattr("vinetrack.pages.plots.recording_view", lambda *_: view)

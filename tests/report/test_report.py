@@ -107,7 +107,6 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
 
 
 def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_nothing_from_elsewhere():
-    """And has each trial with status and reason."""
     html = page(
         figures=[build.ReportFigure("law", "Law", "caption", SVG, "points.csv", "µ,b\n1,2\n")],
         trials=trials("a", "b", status="failed", reason="fewer than 5 points"),

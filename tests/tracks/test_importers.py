@@ -381,7 +381,6 @@ def read_tdms(folder: Path, made: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_times_and_pressures_come_out_as_they_were_written(tmp_path):
-    """A waveform says its own times and unit."""
     time_s, pressure_Pa = read_tdms(tmp_path, BOTH_CHANNELS)
     assert np.array_equal(time_s, TRACE_S)
     assert np.allclose(pressure_Pa, 1000 * PRESSURE_KPA, rtol=1e-15)

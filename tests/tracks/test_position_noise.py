@@ -242,7 +242,6 @@ def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path):
 
 @pytest.mark.slow
 def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
-    """Each release is rounded off by half a millimetre and more, ten times the noise."""
     shot = campaign("smoothed", 20616, (8, 8), weighed=False)
     write_experiment(shot, tmp_path / "laboratory")
     fit = vt.fit(vt.base_model(), tmp_path / "laboratory")
@@ -296,7 +295,6 @@ def test_a_jump_of_only_the_nearest_points_is_sure_where_noise_is_far_below_it(r
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_after_dropped_frames_times_go_on_by_as_many(count):
-    """And where the times show the gap already it is flagged, and they stay."""
     clean = still_then_even()
     rows = np.delete(np.arange(120), range(70, 70 + count))
     out = correct_frames(dropped(clean, 70, count))
@@ -311,7 +309,6 @@ def test_after_dropped_frames_times_go_on_by_as_many(count):
 
 @pytest.mark.parametrize(("stated_m", "told"), [(2e-5, True), (np.nan, True), (5e-4, False)])
 def test_a_long_step_between_points_that_are_stated_to_be_unsure_is_no_dropped_frame(stated_m, told):
-    """Where a door half hides the tip its points leap, and say so."""
     track = dropped(still_then_even(), 60)
     sigma_m = track.lead_position_sigma_m.copy()
     sigma_m[58:62] = stated_m

@@ -92,7 +92,6 @@ def test_another_tracker_is_a_class_of_its_own_in_the_registry(monkeypatch):
 
 
 def test_flicker_is_taken_out_of_every_picture():
-    """Of what lies beyond the end of growth; the light goes up and down by 6 %."""
     frames = plain_scene(Plan(**SHORT, seed=201, flicker=0.06)).frames
     strip = cut_strip(frames, Axis((20.0, 80.0), (490.0, 80.0)), 24)
     beyond = strip.values[:, :, 440:].mean(axis=(1, 2))
@@ -274,9 +273,7 @@ def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path):
 def test_a_fast_tip_at_rest_beside_a_door_is_neither_behind_its_own_film_nor_at_the_doors_far_edge(
     trial, take, seed, tmp_path
 ):
-    """Repeats of the demonstration's fastest trials. The edge at rest was 5 px behind the tip, where film served as its
-    own background, and 17 px ahead of it, where one frame beside the door's edge had drawn the others along.
-    """
+    """Repeats of the demonstration's fastest trials."""
     experiment = read_experiment(Path(__file__).parents[2] / "data" / "demo", strict=True)
     stated = replace(experiment.trial(trial), name=f"{trial}_{take}", video=tmp_path / "a.mp4")
     content = yaml.safe_load(DEMO.read_text(encoding="utf-8"))
@@ -352,10 +349,7 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
 @pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
-    """By root mean squares over three draws: that of one is known to half. Bands further apart count as outliers.
-
-    Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
-    """
+    """By root mean squares over three draws: that of one is known to half. Bands further apart count as outliers."""
     frames = np.arange(100.0)
     true, moves = grown_px(frames), (frames > 12)[:, None]
     found = []
