@@ -22,6 +22,8 @@ from vinetrack.results import Results
 
 PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
 ROWS = ({"trial": "a", "pressure_kPa": "28.5"}, {"trial": "b", "pressure_kPa": "14"})
+OUTSIDE = ("", ".", "..", "../a", "a/../../b", r"..\a", "/etc/passwd", r"\\server\share", "C:/a", r"c:\a", "C:a")
+NO_NAMES = ("", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n")
 
 
 def table_of(tmp_path: Path, data: bytes) -> tables.Table:
@@ -115,10 +117,6 @@ def test_paths_inside(tmp_path):
     (tmp_path / "exp").mkdir()
     (tmp_path / "exp" / "videos").symlink_to(tmp_path / "store")
     assert safe_join(tmp_path / "exp", "videos/a.mp4").read_text() == "frames"
-
-
-OUTSIDE = ("", ".", "..", "../a", "a/../../b", r"..\a", "/etc/passwd", r"\\server\share", "C:/a", r"c:\a", "C:a")
-NO_NAMES = ("", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n")
 
 
 def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused():

@@ -37,6 +37,15 @@ from vinetrack.inference.optimiser import relative_residuals, variance_floor
 from vinetrack.laboratory.campaigns import Vine
 from vinetrack.laboratory.campaigns import campaign as laboratory_campaign
 
+FILM = catalogue()["film_mass"]
+TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
+FLAT = 2 / math.pi - 1
+DIAMETER = catalogue()["area_scale"].parameters[0]
+ANGLE_RIVALS = ("growth_angle", "payload_friction", "pressure_gauge", "leak")
+FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
+DRAG = 0.5
+TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
+
 
 def diagnosed(pairs, candidates=None) -> result.Diagnosis:
     return vt.diagnose(pairs, candidates=candidates, ladder=False, advice=False)
@@ -78,10 +87,6 @@ def test_what_is_missing_is_in_the_answer_with_its_size_and_nothing_where_nothin
     numbers = {number.key: number for number in row_of(said, kind).numbers}
     for key, size in hidden.truth.values.items():
         assert abs(numbers[key].value - size) < 4 * numbers[key].sigma
-
-
-FILM = catalogue()["film_mass"]
-TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
 
 
 @pytest.mark.slow
@@ -182,10 +187,6 @@ def test_one_mistyped_payload_of_several_is_named_with_its_vine(tmp_path):
     assert off[0].value == pytest.approx(0.15 * max(loaded_kg), abs=3 * off[0].sigma)
 
 
-FLAT = 2 / math.pi - 1
-DIAMETER = catalogue()["area_scale"].parameters[0]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "factor", "named", "size"),
@@ -241,9 +242,6 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monk
     assert fit["n"].value == pytest.approx(truths["eversion_damping.n"], abs=3 * fit["n"].sigma)
 
 
-ANGLE_RIVALS = ("growth_angle", "payload_friction", "pressure_gauge", "leak")
-
-
 def filmed(vine: Vine, pressures_kPa: tuple[float, ...], payload_g: float, stated_deg: float, true_deg: float) -> Pairs:
     """Three trials a pressure of a vine that grew in one direction and is stated in another."""
     made = laboratory_campaign(vine, pressures_kPa, 3, payload_g)
@@ -267,9 +265,6 @@ def test_a_bare_vine_of_light_film_cannot_tell():
     told = diagnosed([(replace(t, position_systematic_m=1e-4), track) for t, track in bare], ANGLE_RIVALS)
     assert told.verdict == "adequate"
     assert row_of(told, "growth_angle").largest["growth_angle.f"] > 1.2  # the largest plausible
-
-
-FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
 
 
 @pytest.fixture(scope="module")
@@ -363,10 +358,6 @@ def test_an_effect_that_predicts_no_condition_better_is_said_to():
     told = not_better(table.assign(rms_highest_pressure_m=[3.88, 4.16]))
     assert [(one.code, one.facts["highest"]) for one in told] == [("left_out_error_does_not_fall", k) for k in (0, 1)]
     assert not_better(table.assign(rms_left_out_m=[4.09, 3.2], rms_highest_pressure_m=np.nan)) == []
-
-
-DRAG = 0.5
-TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
 
 
 def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:

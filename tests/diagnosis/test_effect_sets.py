@@ -18,6 +18,9 @@ from vinetrack.effects import find_effect
 
 NAMES = ("air_drag", "leak", "tail_friction")
 TRIPLE = -1000.0
+CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
+TRUTH = {"reservoir_depletion.gamma": 1.3, "tail_friction.mu_w": 1.0}
+LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 
 def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> LikelihoodRatio:
@@ -134,11 +137,6 @@ def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(mon
 
     monkeypatch.setattr(Search, "_refit", refit)
     assert bool(sets_of(pairs(30.0)).superfluous(of(NAMES, TRIPLE))) != needed
-
-
-CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
-TRUTH = {"reservoir_depletion.gamma": 1.3, "tail_friction.mu_w": 1.0}
-LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 
 def asked(*names: str, **how: bool) -> result.Diagnosis:

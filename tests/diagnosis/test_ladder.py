@@ -27,6 +27,10 @@ from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_v
 from vinetrack.pipeline import analysis
 
 DEPLETION = "reservoir_depletion"
+B = "eversion_damping.B"
+Numbers = dict[str, Number]
+PHYSICS = ("reservoir_depletion", "tail_friction", "air_drag", "length_scale")
+"""Where one effect beside the differences is the point; what the catalogue does to a verdict, others ask."""
 
 
 @pytest.fixture(scope="module")
@@ -154,9 +158,6 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs):
     assert table.attrs["notes"]
 
 
-B = "eversion_damping.B"
-
-
 def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs)
 
@@ -223,9 +224,6 @@ def test_single_trials_are_judged_by_the_scatter_of_the_fit():
     assert found.along_position["z"].abs().max() < 4
 
 
-Numbers = dict[str, Number]
-
-
 def made(trials: Sequence[Trial], factors: Sequence[float], seed: int) -> Pairs:
     """Trials made in the order of the sheet, B of each multiplied by its factor."""
     pairs: Pairs = []
@@ -239,10 +237,6 @@ def made(trials: Sequence[Trial], factors: Sequence[float], seed: int) -> Pairs:
 
 def uses(trials: Sequence[Trial]) -> list[int]:
     return [sum(other.vine == trial.vine for other in trials[:i]) for i, trial in enumerate(trials)]
-
-
-PHYSICS = ("reservoir_depletion", "tail_friction", "air_drag", "length_scale")
-"""Where one effect beside the differences is the point; what the catalogue does to a verdict, others ask."""
 
 
 def diagnosed(pairs: Pairs, candidates: Sequence[str] = PHYSICS) -> tuple[Diagnosis, dict[str, Numbers]]:

@@ -22,6 +22,12 @@ from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
+DRAG, INLET = "air_drag.C_D", "inlet_loss.K"
+TRUE_INLET = 1.0
+B = "eversion_damping.B"
+LATCH, OFF = ({"latch_release.F": F, "latch_release.reach": reach} for F, reach in ((0.6, 0.015), (0.3, 0.01)))
+HIDDEN = {"pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}), "latch_release": (LATCH, OFF)}
+P_S_TRUE = 11e3
 
 
 def careful(payload_g: float, seed: int) -> Pairs:
@@ -62,10 +68,6 @@ def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(mak
     assert not asked.rejects_model
     monkeypatch.setattr(questions, "systematics_of", none)
     assert questions.misfit_tests(asked.fit, asked.effects, FIRST).rejects_model
-
-
-DRAG, INLET = "air_drag.C_D", "inlet_loss.K"
-TRUE_INLET = 1.0
 
 
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_what_nobody_can_exclude_is_named():
@@ -117,9 +119,6 @@ def test_a_size_is_not_excluded_within_two_errors_its_plausible_range_and_its_si
     assert selection.sizes_not_excluded(estimate, 0.2, parameter) == pytest.approx(ends)
 
 
-B = "eversion_damping.B"
-
-
 def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs)
 
@@ -168,10 +167,6 @@ def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model()
     assert not questions.has_excess_scatter(replace(fit, trials=tuple(trials)))
 
 
-LATCH, OFF = ({"latch_release.F": F, "latch_release.reach": reach} for F, reach in ((0.6, 0.015), (0.3, 0.01)))
-HIDDEN = {"pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}), "latch_release": (LATCH, OFF)}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HIDDEN)
 def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
@@ -182,9 +177,6 @@ def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
     assert found.chi2_per_dof < 1.3
     for key, size in values.items():
         assert abs(found[key].value - size) < 4 * found[key].sigma
-
-
-P_S_TRUE = 11e3
 
 
 def interrupted(k: int, pressure_Pa: float) -> tuple[Trial, Track]:

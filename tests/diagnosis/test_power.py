@@ -22,6 +22,11 @@ from vinetrack.laboratory.campaigns import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
+LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0))
+FITTED = ["air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
+HOST = vt.make_model([*BASE_EFFECTS, *FITTED])  # one compiled model serves all that are fitted here
+
+B_KNOWN, N = 6.44, 0.37
 
 
 def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), noise_m=1e-4, candidates=CANDIDATES, **cells):
@@ -137,9 +142,6 @@ def test_a_simulated_campaign_is_diagnosed_with_its_effect():
     assert found[1]
 
 
-LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0))
-
-
 @pytest.fixture(scope="module")
 def few():
     design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
@@ -170,12 +172,6 @@ def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_
     never = advice.further_trials(tests, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
-
-
-FITTED = ["air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
-HOST = vt.make_model([*BASE_EFFECTS, *FITTED])  # one compiled model serves all that are fitted here
-
-B_KNOWN, N = 6.44, 0.37
 
 
 def grown(trials, seed: int, off: float = 1.0, size: str = "air_drag.C_D", value: float = 60.0) -> Pairs:

@@ -21,6 +21,10 @@ SLOWER = LOADED.trial(pressure_Pa=14e3)
 VINE = replace(SLOWER, payload_kg=0.0)
 BALL = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
 MODEL = vt.base_model().with_values({"eversion_damping.B": LOADED.B, "eversion_damping.n": N})
+A, LAMBDA, L, PAYLOAD, P_Y, B = LOADED.A, LOADED.lam, LOADED.L, LOADED.payload, LOADED.P_y, LOADED.B
+MU = 0.5
+FALL_AND_RISE = (np.array([0.0, 0.05, 0.06, 0.10, 0.11, 1.0]), np.array([28e3, 28e3, 12e3, 12e3, 28e3, 28e3]))
+BASE = vt.base_model().with_values({"eversion_damping.B": 6.44})
 
 
 def test_a_dropped_ball_falls_half_g_t_squared():
@@ -103,11 +107,6 @@ def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path
     truth = np.where(beyond > 0, drawn, 0.5 * G * times_s**2)
     # Steps across the breakpoint err by 1.3e-5, those that end there by 2.7e-6: the tolerance of a step and no more.
     np.testing.assert_allclose(found.lead_position_m, truth, rtol=5e-6)
-
-
-A, LAMBDA, L, PAYLOAD, P_Y, B = LOADED.A, LOADED.lam, LOADED.L, LOADED.payload, LOADED.P_y, LOADED.B
-MU = 0.5
-FALL_AND_RISE = (np.array([0.0, 0.05, 0.06, 0.10, 0.11, 1.0]), np.array([28e3, 28e3, 12e3, 12e3, 28e3, 28e3]))
 
 
 def by_hand(times, pressure, first_Pa: float, tau: float, down: float, mu: float) -> tuple[np.ndarray, list[float]]:
@@ -223,9 +222,6 @@ def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):
             assert one.status == other.status
             for name in ("lead_position_m", "tail_velocity_m_s", "observed_position_m"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-BASE = vt.base_model().with_values({"eversion_damping.B": 6.44})
 
 
 def trial(**others: object) -> Trial:

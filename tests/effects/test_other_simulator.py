@@ -33,6 +33,15 @@ WRITTEN_OUT = ("growth_angle", "lens", "moving_average", "rolling_shutter", "sup
 """Effects that are held against a vine written out by hand instead, below."""
 
 TIMES = FRAME_S * np.arange(-3, 1200)
+PACKAGE = Path(vt.__file__).parent
+BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
+MIXTURE_TIMES = np.linspace(0.0, 0.3, 200)
+DRAWN_LAST = ("film_mass", "payload_mass")
+"""Effects that came after the seeds, in the order in which they came: the others keep their sizes."""
+FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
+FINE = np.linspace(0, 0.15, 50)
+P_S = 8e3
+UP_AND_DOWN = (np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), np.array([2e3, 12e3, 1e3, 1e3, 11e3, 11e3]))
 
 
 def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
@@ -53,10 +62,6 @@ def test_two_simulators_agree(effect):
         seen = np.isfinite(other)
         assert np.nanmax(other) > 0.2 * trial.length_m
         np.testing.assert_allclose(other[seen], theirs[seen], atol=1e-8)
-
-
-PACKAGE = Path(vt.__file__).parent
-BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 
 
 @lru_cache
@@ -145,11 +150,6 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
 
 
-MIXTURE_TIMES = np.linspace(0.0, 0.3, 200)
-DRAWN_LAST = ("film_mass", "payload_mass")
-"""Effects that came after the seeds, in the order in which they came: the others keep their sizes."""
-
-
 def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
     rng = np.random.default_rng(seed)
     D, L, P, B = (rng.uniform(*ends) for ends in ((5e-3, 30e-3), (0.15, 0.6), (8e3, 60e3), (0.5, 6.0)))
@@ -228,12 +228,6 @@ def test_a_measured_pressure_already_holds_what_happens_in_the_chamber(name):
     plain = simulated(LOADED, {}, FINE, trace).lead_position_m
     np.testing.assert_array_equal(simulated(LOADED, {name: 1.2}, FINE, trace).lead_position_m, plain)
     assert np.max(np.abs(simulated(LOADED, {name: 1.2}, FINE).lead_position_m - plain)) > 1e-4
-
-
-FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
-FINE = np.linspace(0, 0.15, 50)
-P_S = 8e3
-UP_AND_DOWN = (np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), np.array([2e3, 12e3, 1e3, 1e3, 11e3, 11e3]))
 
 
 def held_by_hand(times: np.ndarray) -> tuple[np.ndarray, list[tuple[float, float]]]:

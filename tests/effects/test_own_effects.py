@@ -36,6 +36,8 @@ def tail_force(s, rig, q):
 
 WORKED = (Worked("tail_force", -0.4, "0.8 × √0.25", state={"tail_position": 0.25}, parameters={"q": 0.8}),)
 '''
+FOLDER = Path(effects.__file__).parent
+each_effect = pytest.mark.parametrize("effect", catalogue().values(), ids=catalogue())
 
 
 def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
@@ -150,10 +152,6 @@ def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file, monkeyp
     with pytest.raises(EffectError):
         load_effect(effect_file)
     assert not effect_file.with_suffix(".ran").exists()
-
-
-FOLDER = Path(effects.__file__).parent
-each_effect = pytest.mark.parametrize("effect", catalogue().values(), ids=catalogue())
 
 
 def test_the_folder_is_the_catalogue_with_the_base_first():

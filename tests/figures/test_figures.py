@@ -20,6 +20,7 @@ from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
 N = 0.4
+REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
 
 
 def fit(*B: float) -> dict:
@@ -34,9 +35,6 @@ def fit(*B: float) -> dict:
 
 def damping(n_vines: int = 2) -> dict:
     return dict.fromkeys(("log_log", "both_axes"), fit(*range(1, n_vines + 1)))
-
-
-REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
 
 
 def points(n_vines: int = 2) -> pd.DataFrame:

@@ -30,6 +30,8 @@ from vinetrack.inference.trial_effects import trial_costs
 from vinetrack.interface import ERROR_COLUMNS
 from vinetrack.tracks.position_noise import rest_points
 
+STEP_M = 2e-3
+
 
 @pytest.fixture(scope="module")
 def campaign():
@@ -408,9 +410,6 @@ def test_film_influence_agrees_with_refits_with_heavier_film():
     n = fit.numbers.index(fit["n"])
     assert moved[n] > fit.numbers[n].sigma
     assert not vt.film_influence(vt.refit(fit, fit.model + "film_mass")).any()
-
-
-STEP_M = 2e-3
 
 
 def rounded(seed: int, step_m: float = STEP_M):

@@ -21,6 +21,7 @@ from vinetrack.tracks.position_noise import ar1_noise
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 FRAMES = np.arange(TIMES_S.size)
 LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
+GROWTH_M = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
 
 
 def without_noise(pressure_Pa: np.ndarray) -> np.ndarray:
@@ -46,9 +47,6 @@ def test_exact_pressures_are_unchanged_and_equal_readings_handled():
     told_Pa = 20e3 + 100.0 * (np.arange(60) == 30)  # readings that are nearly all equal
     assert gauge.noise_correlations([told_Pa] * 4) == [0.0]
     assert np.isfinite(without_noise(told_Pa)).all()
-
-
-GROWTH_M = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
 
 
 def emptied(seed: int, noise_Pa: float = 50.0, beyond: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -29,6 +29,16 @@ START_S, ORIGIN_M, SPEED = 0.05, 0.02, 1.0
 TIME = START_S + np.arange(200) / 1000
 WINDOW = Window("gated", True, "", from_s=START_S + 0.0499, to_s=START_S + 0.1501, n_points=101, x_ss_m_s=2 * SPEED)
 RELEASE = Release(START_S, ORIGIN_M, 1e-5, False, "")
+FOUND_WITHIN = [
+    (scaled(1, 3.0), 3e-5, 0.5), (scaled(1, 10.0), 1e-4, 0.5), (scaled(3, 5.0), 1e-4, 1.0),
+    (scaled(4, 10.0), 1e-4, 1.0), (scaled(4, 1.0), 1e-4, 2.0), (scaled(4, 0.3), 3e-5, 2.0),
+]  # fmt: skip
+SLOW = scaled(4, 1.5)
+BARE_TRIAL = Trial(name="", diameter_m=0.012, thickness_m=100e-6, length_m=0.2, pressure_Pa=24e3, yield_pressure_Pa=3e3)
+LOADED_TRIAL = replace(BARE_TRIAL, pressure_Pa=34e3, payload_kg=0.0356)
+KINDS = {"bare": (BARE_TRIAL, 4), "loaded": (LOADED_TRIAL, 3), "alone": (replace(BARE_TRIAL, pressure_Pa=30e3), 1)}
+KNOWN = with_names([replace(one, name=f"{name}{i}") for name, (one, count) in KINDS.items() for i in range(count)])
+LONG = replace(LOADED_TRIAL, length_m=0.3)
 
 
 def moved(pressure_Pa: np.ndarray | None = None, trial: Trial = VINE) -> TrialMotion:
@@ -104,12 +114,6 @@ def release_of(track: Track, travel_ratio: float = 2.0) -> Release:
     return find_release(track, estimate_kinematics(track, travel_ratio=travel_ratio))
 
 
-FOUND_WITHIN = [
-    (scaled(1, 3.0), 3e-5, 0.5), (scaled(1, 10.0), 1e-4, 0.5), (scaled(3, 5.0), 1e-4, 1.0),
-    (scaled(4, 10.0), 1e-4, 1.0), (scaled(4, 1.0), 1e-4, 2.0), (scaled(4, 0.3), 3e-5, 2.0),
-]  # fmt: skip
-
-
 @pytest.mark.parametrize(("vine", "noise_m", "frames"), FOUND_WITHIN, ids=str)
 def test_onset_is_found_to_within_frames(vine, noise_m, frames):
     off = []
@@ -144,9 +148,6 @@ def test_motion_from_the_first_frame_is_said_and_a_start_just_missed_is_extrapol
     assert release.moving_from_start
     assert release.time_s == pytest.approx(0.0, abs=1e-3)
     assert abs(release.lead_position_m) < 3e-4
-
-
-SLOW = scaled(4, 1.5)
 
 
 def summarise(vine: Vine, **changes: object) -> tuple[Recording, dict, dict]:
@@ -197,12 +198,6 @@ def test_a_falling_ball_is_measured_but_has_no_place_in_the_law():
     assert math.isnan(float(result.row["efficiency"]))  # type: ignore[arg-type]
 
 
-BARE_TRIAL = Trial(name="", diameter_m=0.012, thickness_m=100e-6, length_m=0.2, pressure_Pa=24e3, yield_pressure_Pa=3e3)
-LOADED_TRIAL = replace(BARE_TRIAL, pressure_Pa=34e3, payload_kg=0.0356)
-KINDS = {"bare": (BARE_TRIAL, 4), "loaded": (LOADED_TRIAL, 3), "alone": (replace(BARE_TRIAL, pressure_Pa=30e3), 1)}
-KNOWN = with_names([replace(one, name=f"{name}{i}") for name, (one, count) in KINDS.items() for i in range(count)])
-
-
 def row(name: str, x_ss: float = math.nan, final: float = math.nan, status: str = "ok", **numbers: float) -> dict:
     condition = next(trial.condition for trial in KNOWN if trial.name == name)
     speeds = {"x_ss_m_s": x_ss, "x_ss_sigma_m_s": 0.05, "final_lead_velocity_m_s": final, "efficiency": math.nan}
@@ -249,9 +244,6 @@ def test_failed_trials_count_for_nothing_and_efficiency_has_its_variants():
     assert loaded["weight_share"] == pytest.approx(share, rel=1e-6)
     assert loaded["efficiency_with_weight"] == pytest.approx(0.52 / (1 + share), rel=1e-6)
     assert loaded["efficiency_with_weight_sigma"] == pytest.approx(0.02 / (1 + share), rel=1e-6)
-
-
-LONG = replace(LOADED_TRIAL, length_m=0.3)
 
 
 def test_velocity_where_a_position_is_passed_is_interpolated():

@@ -16,6 +16,12 @@ from vinetrack.kinematics.summary import TrialResult, estimate_kinematics, fit_a
 
 SEEDS, LIMITS = range(1000, 1010), SteadySettings()
 STEADY = [scaled(1, 0.2), scaled(1, 3.0), scaled(2, 1.0), scaled(3, 5.0), scaled(4, 3.0)]
+B, N, CHAMBER_M3, GAMMA, AMBIENT_PA = 6.44, 0.37, 1e-3, 1.4, 101_325.0
+STEP_S = 1 / 1069
+SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
+VINES = [scaled(1, 0.2), scaled(2, 1.0), scaled(3, 5.0), scaled(4, 3.0), scaled(4, 10.0)]
+EVEN = np.arange(60) / 1000
+GAPPED = np.delete(np.arange(64) / 1000, [20, 21, 22, 40])
 
 
 def gated(track, travel_ratio=2.0, length_m=math.nan):
@@ -142,10 +148,6 @@ def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend()
     assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)
 
 
-B, N, CHAMBER_M3, GAMMA, AMBIENT_PA = 6.44, 0.37, 1e-3, 1.4, 101_325.0
-STEP_S = 1 / 1069
-
-
 def analysed(pressure_kPa: float, seed: int) -> TrialResult:
     """A vine that empties its chamber, with the pressure recorded."""
     more = {"vine": "v", "condition": f"{pressure_kPa:g}", "capture_fps": 1 / STEP_S, "chamber_m3": CHAMBER_M3}
@@ -206,10 +208,6 @@ def test_the_run_is_the_longest_there_is(seed):
         assert window.cv == pytest.approx(np.std(run, ddof=1) / abs(run.mean()))
 
 
-SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
-VINES = [scaled(1, 0.2), scaled(2, 1.0), scaled(3, 5.0), scaled(4, 3.0), scaled(4, 10.0)]
-
-
 @pytest.mark.parametrize("vine", VINES, ids=str)
 @pytest.mark.parametrize(("noise_m", "rho"), [(3e-5, 0.0), (1e-4, 0.6), (3e-4, 0.3)])
 def test_as_good_as_the_best_single_window_with_the_truth_in_hand_and_its_error_is_stated(vine, noise_m, rho):
@@ -262,10 +260,6 @@ def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
         off = kinematics.lead_velocity_m_s[150:162] - 0.2
         pulls.append(off / kinematics.lead_velocity_sigma_m_s[150:162])
     assert 0.2 < np.median(np.abs(pulls)) < 2
-
-
-EVEN = np.arange(60) / 1000
-GAPPED = np.delete(np.arange(64) / 1000, [20, 21, 22, 40])
 
 
 @pytest.mark.slow

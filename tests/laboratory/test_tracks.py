@@ -21,6 +21,13 @@ from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scen
 from vinetrack.tracks.importers import load_track
 
 ROOT = Path(__file__).parents[2]
+EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
+PAPER = ROOT / "data" / "paper"
+LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))
+WORN = Should(("artefact",), any_of=("*order*",), only=("*order*",), true=("*order*",))
+BOTH = Should(("missing", "ambiguous"), ("drag",), all_of=("drag", "inlet"), true=("drag", "inlet"), holds=("drag.C",))
+FILM, BEHIND = 52428.0, 6553.0
+"""Levels of `clean` film (0.8) and of what is behind it (0.1) in 16 bits."""
 
 
 def few() -> list[Trial]:
@@ -29,9 +36,6 @@ def few() -> list[Trial]:
 
 def nature(**changes: object) -> campaigns.GroundTruth:
     return campaigns.GroundTruth(values=campaigns.damping_values(few()), **changes)  # type: ignore[arg-type]
-
-
-EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 
 def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others():
@@ -126,9 +130,6 @@ def test_what_is_written_reads_back_without_a_word(tmp_path):
         assert track.pressure_Pa is not None
 
 
-PAPER = ROOT / "data" / "paper"
-
-
 def test_the_papers_nature_has_the_printed_numbers():
     """B of a printed diameter is in proportion to the wall; of the 25 mm vine it is 6.44 × ½ × (25/24)^0.75 = 3.320."""
     trials = read_experiment(PAPER).trials
@@ -154,11 +155,6 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path):
     assert filmed.settings.calibration.square_mm == pytest.approx(15)
     with pytest.raises(ValueError, match="recordings already"):
         campaigns.recording_experiment(read_experiment(ROOT / "data" / "demo"), filming, tmp_path / "again")
-
-
-LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))
-WORN = Should(("artefact",), any_of=("*order*",), only=("*order*",), true=("*order*",))
-BOTH = Should(("missing", "ambiguous"), ("drag",), all_of=("drag", "inlet"), true=("drag", "inlet"), holds=("drag.C",))
 
 
 def answer(verdict: str, *names: str, size: tuple[float, float] | None = None) -> Answer:
@@ -204,10 +200,6 @@ def steadily(lead_m_s: float, from_s: float = 0.0):
 
 def renderer(scene: Scene, motion=None, n_frames: int = 60, **settings) -> FrameRenderer:
     return FrameRenderer(scene, motion or steadily(2.0), n_frames=n_frames, capture_fps=FPS, **settings)
-
-
-FILM, BEHIND = 52428.0, 6553.0
-"""Levels of `clean` film (0.8) and of what is behind it (0.1) in 16 bits."""
 
 
 @pytest.mark.slow

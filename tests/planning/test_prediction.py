@@ -23,6 +23,11 @@ EDGE, TENSION, LEAST_TENSION = "speed of the leading edge", "tension of the tail
 FAST = {name: str(value) for name, value in motions.FAST_VINE.items()}
 SIZES = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 VINE = dict(zip(SIZES, (24, 200, 280, 28), strict=True))
+B, N = "eversion_damping.B", "eversion_damping.n"
+PSI = 6.894757
+SAFE = dict(zip(SIZES, (18, 150, 250, 24), strict=True)) | {"growth_angle_deg": 180, "chamber_l": 50}
+PUSHING = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 14, "growth_angle_deg": 0}
+EXACT = vt.StatedValues(n=0.37, spreads=(0.0, 0.0))
 
 
 def trial(**values: object) -> Trial:
@@ -101,9 +106,6 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time():
     there = prediction.curve.iloc[60]
     positions = [float(np.interp(there["time_high_90_s"], m.time_s, m.lead_position_m)) for m in moved]
     assert np.quantile(positions, 0.05, method="inverted_cdf") == pytest.approx(there["lead_position_m"], rel=0.01)
-
-
-B, N = "eversion_damping.B", "eversion_damping.n"
 
 
 def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> guess.FitNumbers:
@@ -207,9 +209,6 @@ def test_the_guess_is_exact_for_the_largest_printed_vine_and_its_error_that_of_a
     assert guess.damping_log_sigma((25e-3, 100e-6), guess.TABLE_I[4].size) == pytest.approx(expected)
 
 
-PSI = 6.894757
-
-
 @pytest.mark.parametrize(
     ("damping", "factor", "yield_factor", "added_Pa", "suspected"),
     [
@@ -238,15 +237,9 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_no_right_one(damping, factor,
     assert all(problem.severity == "warning" and suspected in problem.message for problem in found)
 
 
-SAFE = dict(zip(SIZES, (18, 150, 250, 24), strict=True)) | {"growth_angle_deg": 180, "chamber_l": 50}
-
-
 def predicted(said: vt.StatedValues | None = None, tail_slack: str = "taut", **values: object):
     safe = unsaid(**{**SAFE, "yield_pressure_kPa": 3, **values})
     return vt.predict_vine(vt.predictive_inputs(replace(safe, tail_slack=tail_slack), said), samples=60)
-
-
-PUSHING = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 14, "growth_angle_deg": 0}
 
 
 @pytest.mark.parametrize(
@@ -290,9 +283,6 @@ def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in_and_only_t
     assert "inlet_loss" not in names  # no inlet in the sheet
     assert "payload_drag" not in names  # no payload
     assert {"reservoir_depletion", "fold_inertia", "gas_inertia"} <= names
-
-
-EXACT = vt.StatedValues(n=0.37, spreads=(0.0, 0.0))
 
 
 def on_chamber(**values: object) -> Trial:

@@ -16,6 +16,13 @@ from vinetrack.tracks.position_noise import rejected_points_note
 
 TIMES = np.arange(8) / 100
 POSITIONS = 0.5 * 9.81 * TIMES**2
+SCALE = 400.0  # px per m
+FRAMES = [2, 3, 4, 6, 7, 9]
+TRAVEL = 0.05 * np.arange(6) ** 1.5
+MARKS = {n: (100 + 0.8 * SCALE * s, 250 - 0.6 * SCALE * s) for n, s in zip(FRAMES, TRAVEL, strict=True)}
+CLOCK_S = np.arange(120) / 200
+TRACE_S = np.arange(12) * 2e-3 + 0.1
+PRESSURE_KPA = 20 + np.arange(12) ** 2 / 8.0
 
 
 def write(folder: Path, text: str, name: str = "track.csv", encoding: str = "utf-8") -> Path:
@@ -173,9 +180,6 @@ def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path):
     np.testing.assert_allclose(track.lead_position_m, -there, atol=2e-9)
 
 
-SCALE = 400.0  # px per m
-
-
 def tracker(name: str, content: object) -> str:
     """A property of a Tracker project."""
     return f'<property name="{name}">{content}</property>'
@@ -207,11 +211,6 @@ def project(marks, axes: str | None = None, unit: str = "m", clock: str = tracke
         tracker("length_unit", unit),
         tracker("tracks", tracker("item", thing("cabrillo.tracker.CoordAxes")) + tracker("item", tip)),
     )
-
-
-FRAMES = [2, 3, 4, 6, 7, 9]
-TRAVEL = 0.05 * np.arange(6) ** 1.5
-MARKS = {n: (100 + 0.8 * SCALE * s, 250 - 0.6 * SCALE * s) for n, s in zip(FRAMES, TRAVEL, strict=True)}
 
 
 def test_a_project_with_frames_left_out_and_a_camera_that_moved(tmp_path):
@@ -302,9 +301,6 @@ def test_a_file_with_times_to_the_millisecond_is_read(tmp_path):
         assert np.diff(read_track(path).time_s) == pytest.approx(1 / 1069, rel=2e-3)
 
 
-CLOCK_S = np.arange(120) / 200
-
-
 def ended(position_m: np.ndarray, seed: int = 620, **stated: float):
     trial = Trial(name="t", **({"travel_ratio": 1.0} | stated))
     noise = np.random.default_rng(seed).normal(0, 2e-4, position_m.size)
@@ -356,10 +352,6 @@ def test_only_bodies_without_chosen_frames_are_cut(tmp_path, travel_ratio, frame
     path = write(tmp_path, "time_s,position_m\n" + rows(CLOCK_S, fall(0.7, 0.6)))
     track = importers.load_track(Trial(name="ball", track=path, travel_ratio=travel_ratio, frames_used=frames_used))
     assert with_flag(track.flag, "after_end").any() == ends
-
-
-TRACE_S = np.arange(12) * 2e-3 + 0.1
-PRESSURE_KPA = 20 + np.arange(12) ** 2 / 8.0
 
 
 def tdms(**channels: np.ndarray | tuple[np.ndarray, dict]) -> bytes:

@@ -18,6 +18,15 @@ from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 from vinetrack.tracks.position_noise import detect_smoothing, noise_shape, position_noise, reject_outliers
 
 FRAMES = np.arange(300) / 1069
+NOISE_M = 6e-5
+UNSTATED = [None] * 8
+FRAME_S = 1 / CAPTURE_FPS
+TIME_S = np.arange(150) / 1000.0
+TRIAL = Trial(name="t", capture_fps=1000.0)
+CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
+    *((scaled(1, 1.0), 3e-5, 0.0), (scaled(2, 5.0), 1e-4, 0.0), (scaled(2, 5.0), 1e-4, 0.6)),
+    *((scaled(3, 10.0), 1e-4, 0.6), (scaled(4, 3.0), 1e-4, 0.0), (scaled(4, 10.0), 3e-4, 0.3)),
+]
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6, 0.8])
@@ -78,10 +87,6 @@ def test_noise_of_rounded_positions_is_not_kept_below_rounding():
     assert position_noise(np.arange(y.size) / 267, y, robust=True)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
 
 
-NOISE_M = 6e-5
-UNSTATED = [None] * 8
-
-
 def experiment(rho: float = 0.0, seed: int = 20000) -> list[list[np.ndarray]]:
     """Times and positions of fast vines."""
     made = [record(scaled(2, 10.0), np.random.default_rng(seed + i), noise_m=NOISE_M, rho=rho) for i in range(8)]
@@ -111,9 +116,6 @@ def test_standard_deviations_that_a_file_states_are_used_where_they_hold_and_onl
     np.testing.assert_allclose(ratio, ratio[0])
     assert ratio[0] == pytest.approx(2.0, rel=0.2)
     assert noise_shape(times, positions, stated) is None
-
-
-FRAME_S = 1 / CAPTURE_FPS
 
 
 def recorded(seed: int, end_frames: int = 0) -> list[Track]:
@@ -205,10 +207,6 @@ def test_rounded_positions_have_no_outliers_or_missing_frames(step_m, every):
         assert not correct_frames(reject_outliers(plain_track(track.time_s[::every], position_m))).notes
 
 
-TIME_S = np.arange(150) / 1000.0
-TRIAL = Trial(name="t", capture_fps=1000.0)
-
-
 def smooth_tracks(seed: int, rho: float = 0.0, smooth=lambda y: y) -> list[tuple[Trial, Track]]:
     """Eight, from rest at 20 ms, at up to 3 m/s."""
     draw, since = np.random.default_rng(seed), np.clip(TIME_S - 0.02, 0.0, None)
@@ -249,12 +247,6 @@ def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
     (n,) = (number for number in fit.numbers if number.key == "eversion_damping.n")
     truth = shot.truth["truths"]["eversion_damping.n"]  # type: ignore[index]
     assert n.low < truth < n.high
-
-
-CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
-    *((scaled(1, 1.0), 3e-5, 0.0), (scaled(2, 5.0), 1e-4, 0.0), (scaled(2, 5.0), 1e-4, 0.6)),
-    *((scaled(3, 10.0), 1e-4, 0.6), (scaled(4, 3.0), 1e-4, 0.0), (scaled(4, 10.0), 3e-4, 0.3)),
-]
 
 
 def stale(track: Track, row: int) -> Track:

@@ -20,6 +20,14 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.strip import Strip, cut_strip
 from vinetrack.video.track import hops_between_bodies, in_metres, track_frames, track_pixels, track_recording
 
+MOUTH = (60, 120)
+OPEN_RAD = math.radians(25)
+SWING = range(10, 16)
+RATE = 1000.0
+G_PX = 9.81 / 0.5e-3 / RATE**2  # px a frame², at 0.5 mm a pixel
+SHAPE = (420, 160)
+BALL = Trial(name="ball", capture_fps=RATE, m_per_px=0.5e-3, travel_ratio=1)
+
 
 def test_black_background_is_not_used_for_flicker():
     luma = np.zeros((12, 120, 200), np.uint16)
@@ -28,11 +36,6 @@ def test_black_background_is_not_used_for_flicker():
     assert np.ptp(strip.scale) == 0
     assert not strip.offset.any()
     assert not strip.stabilised
-
-
-MOUTH = (60, 120)
-OPEN_RAD = math.radians(25)
-SWING = range(10, 16)
 
 
 def beside_a_door(seed: int, growth_px: int, door_px: int, speed_px: float, tube_px: int = 14) -> np.ndarray:
@@ -138,11 +141,6 @@ def test_shake_added_to_a_position_is_where_the_edge_is_seen():
     assert np.nanstd(off_px - shake_px) < 0.15
 
 
-RATE = 1000.0
-G_PX = 9.81 / 0.5e-3 / RATE**2  # px a frame², at 0.5 mm a pixel
-SHAPE = (420, 160)
-
-
 def falling_disc(seed, body=150.0, back=70.0, marks=25.0, rest=8, n=185):
     """Frames (n, height, width), uint8, of a marked disc falling from rest, and its true row (n,)."""
     rng = np.random.default_rng(seed)
@@ -161,9 +159,6 @@ def falling_disc(seed, body=150.0, back=70.0, marks=25.0, rest=8, n=185):
         picture = cv2.GaussianBlur(backdrop + cover * (body + drawn - backdrop), (0, 0), 0.8)
         frames[i] = np.clip(np.rint(picture + rng.normal(0, 2, SHAPE)), 0, 255)
     return frames, row
-
-
-BALL = Trial(name="ball", capture_fps=RATE, m_per_px=0.5e-3, travel_ratio=1)
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ DEMO = preset("demo")
 CAMERA = Camera(m_per_px=1 / 2400, focal_px=1500, k1=-0.2, k2=0.05, tilt_x_deg=4, tilt_y_deg=-7)
 BOARD = Target(squares=(16, 5), square_m=0.020, marker_m=0.014, angle_deg=1.5)
 CHECKER = replace(BOARD, kind="checkerboard")
+AXIS = ((120.0, 150.0), (840.0, 175.0))
 
 
 def stated(target: Target = BOARD, **changes) -> Charuco | Checkerboard:
@@ -35,9 +36,6 @@ def picture(target: Target = BOARD, camera: Camera = CAMERA, seed: int = 2000, *
 def true_length_m(camera: Camera, ends) -> float:
     plane = camera.plane_from_picture(np.array(ends, dtype=float)) * camera.m_per_px
     return float(np.linalg.norm(plane[1] - plane[0]))
-
-
-AXIS = ((120.0, 150.0), (840.0, 175.0))
 
 
 def scale_error(found, camera: Camera = CAMERA, ends=AXIS) -> tuple[float, float]:

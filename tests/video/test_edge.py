@@ -31,6 +31,12 @@ from vinetrack.video.strip import Look, Positions, Tracker, cut_strip, steadied
 from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, moving_range, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
+MOUTH_PLAN = Plan(seed=520, width=640, height=200, from_px=(20.0, 100.0), end_px=520.0, rest_frames=15)
+AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
+"""Six rows beside the middle of the tube."""
+COLUMNS = 460
+LONG_AXIS = Axis((20.0, 59.5), (440.0, 59.5), 40.0)
+FITS = "from test_edge import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"
 
 
 def followed(**changes) -> tuple[Scene, Tracking]:
@@ -224,9 +230,6 @@ def test_a_recording_is_tracked_with_its_corrections(tmp_path):
     assert np.flatnonzero(with_flag(after.flag, "corrected")).tolist() == [20, 25]
 
 
-MOUTH_PLAN = Plan(seed=520, width=640, height=200, from_px=(20.0, 100.0), end_px=520.0, rest_frames=15)
-
-
 def ok(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Which points have no flag, and the edge, px."""
     track = pictures.tracked(scene.frames, scene.plan.exposure, m_per_px=1.0).track
@@ -286,10 +289,6 @@ def test_a_fast_tip_at_rest_beside_a_door_is_neither_behind_its_own_film_nor_at_
     assert abs(np.nanmedian(error_px[resting]) - np.nanmedian(error_px[passed])) < 1.5  # of it 0.7 by the lens
 
 
-AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
-"""Six rows beside the middle of the tube."""
-
-
 def tube() -> np.ndarray:
     """A bright front that passes 5 columns a frame over noise and leaves 41 rows changed behind it."""
     n, rows, columns = 72, 121, 300
@@ -310,10 +309,6 @@ def test_without_a_front_along_axis_and_middle_only_the_arrival_is_followed(monk
     assert positions.is_edge is (min(on_axis, beside) >= 0)
     moving = slice(14, 60)
     assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3
-
-
-COLUMNS = 460
-LONG_AXIS = Axis((20.0, 59.5), (440.0, 59.5), 40.0)
 
 
 def step_errors(luma: np.ndarray, exposure: float, true: np.ndarray):
@@ -472,9 +467,6 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     known, ignored = (fitted(strip, edge - 1.4, pictures, shading)[:, 0] - edge for shading in (RIM, 0 * RIM))
     assert np.abs(known).max() < 0.15
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
-
-
-FITS = "from test_edge import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"
 
 
 @pytest.mark.slow

@@ -33,6 +33,10 @@ RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
 NOISE = RNG.integers(0, 255, (60, 96, 128)).astype(np.uint8)
 DEEP = FRAMES.astype(np.uint16) * 17
+BEFORE, AFTER = 300, 180
+"""Frames of rest beyond those of the scene."""
+CAPTURE_FPS = 1069.0
+KEY_FRAMES = (0, 30, 60)
 
 
 @pytest.mark.parametrize(
@@ -258,10 +262,6 @@ def test_a_sheet_that_contradicts_the_recording_is_refused(tmp_path):
         capture_exposure(replace(trial, exposure_s=400e-6), recording)
 
 
-BEFORE, AFTER = 300, 180
-"""Frames of rest beyond those of the scene."""
-
-
 @pytest.fixture(scope="module")
 def filmed():
     """A scene, and its frames with rest before and after it, each frame of rest with grain of its own."""
@@ -395,10 +395,6 @@ def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path)
         write_clip(tmp_path / f"{k}.mp4", iter(noisy), 9.0)
         written.append((tmp_path / f"{k}.mp4").read_bytes())
     assert len(set(written)) == 1
-
-
-CAPTURE_FPS = 1069.0
-KEY_FRAMES = (0, 30, 60)
 
 
 @dataclass(frozen=True)

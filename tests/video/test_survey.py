@@ -21,6 +21,8 @@ from vinetrack.video.survey import RecordingFacts, Surveyor
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"
 ROW = "24,200,280,28,3"
 SCALE = "capture_fps: 1000\ncalibration: {kind: mm_per_px, mm_per_px: 0.3}\n"
+FILMED = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px, mm_per_px: 0.24}\n"
+RIGHT = "12,100,140,36,3"
 
 
 def write_clip(path: Path, n_frames: int = 40, index_first: bool = True, share: float = 1.0) -> None:
@@ -164,10 +166,6 @@ def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture
         capture_rate(replace(VINE, capture_fps=60.0), recording)
     assert capture_rate(replace(VINE, capture_fps=60.0, capture_fps_is_playback=True), recording) == 60
     assert capture_rate(replace(VINE, capture_fps=61.0), recording) == 61
-
-
-FILMED = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px, mm_per_px: 0.24}\n"
-RIGHT = "12,100,140,36,3"
 
 
 @pytest.mark.slow
