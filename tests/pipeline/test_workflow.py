@@ -138,18 +138,6 @@ def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
     assert [*planned(experiment(tmp_path / "w")).jobs] == ["trials", "model", "report"]
 
 
-def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path):
-    folder = experiment(tmp_path / "v")
-    (folder / "a.mp4").write_bytes(b"film")
-    (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
-    (folder / "experiment.yaml").write_text("published: measured\n")
-    plan = planned(folder)
-    known = set(plan.files("<measurements>"))
-    for stage in STAGES.values():
-        assert {path for group in stage.reads for path in plan.files(group)} <= known
-        known |= {path for group in stage.writes for path in plan.files(group)}
-
-
 # `vinetrack run`: the chain from anywhere, its progress, its last lines, and whose results a folder holds.
 def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path, monkeypatch):
     folder = experiment(tmp_path / "week" / "my vines")

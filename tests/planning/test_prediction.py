@@ -81,12 +81,6 @@ def test_the_tension_is_what_the_tip_leaves_of_the_drive():
     assert prediction[LEAST_TENSION].median == pytest.approx(curve["tension_N"].min(), abs=0.01)
 
 
-def test_a_tail_that_carries_nothing_has_no_tension_of_the_last_digits():
-    """Level and bare, a vine at its steady speed has the tension m·ẍ = 0, and never a negative one."""
-    prediction = vt.predict_vine(certain(trial(yield_pressure_kPa=3, growth_angle_deg=90), 20.0), samples=2)
-    assert (prediction[TENSION].median, prediction[LEAST_TENSION].low) == (0.0, 0.0)
-
-
 def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
     inputs = certain(vt.planned_trial(FAST).trials[0], 3.3)
