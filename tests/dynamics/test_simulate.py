@@ -200,16 +200,6 @@ def test_removing_by_effect_or_by_name_removes_its_values():
             twice()
 
 
-def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
-    assert vt.base_model().parameter_names == ("gravity.g", "eversion_damping.B", "eversion_damping.n")
-    assert vt.base_model().parameters_for("any").tolist() == [9.81, 3.0, 0.37]
-    model = vt.base_model().with_values({"eversion_damping.n": 0.5})
-    model = model.with_values({"eversion_damping.B": {"thin": 1.0, "thick": 4.0}})
-    assert model.parameters_for("thick").tolist() == [9.81, 4.0, 0.5]
-    with pytest.raises(EffectError):
-        model.parameters_for("other")
-
-
 def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):
     sizes = {"eversion_damping.B": 6.44, "eversion_damping.n": N, "reservoir_depletion.gamma": 1.3, "air_drag.C_D": 1.1}
     model: vt.Model = (vt.base_model() + "reservoir_depletion" + "air_drag").with_values(sizes)

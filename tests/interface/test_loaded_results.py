@@ -84,14 +84,6 @@ def test_the_story_of_the_readme_runs(small_run, tmp_path, monkeypatch):
     assert (tmp_path / "ladder.png").exists()
 
 
-def test_a_frame_of_tracks_in_other_units_is_the_same_experiment():
-    frame = vt.example_tracks()
-    inches = frame.assign(diameter_in=frame["diameter_mm"] / 25.4).drop(columns="diameter_mm")
-    trials = [[trial for trial, _ in vt.tracks_from_frame(one)] for one in (frame, inches)]
-    assert [round(1e3 * trial.diameter_m, 9) for trial in trials[1]] == [24.0] * 8
-    assert [trial.condition for trial in trials[0]] == [trial.condition for trial in trials[1]]
-
-
 def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_pressure_is_a_trace():
     frame = vt.example_tracks()
     wrong = [frame.drop(columns="time_s"), frame.drop(columns="thickness_um"), frame.assign(diameter_mm=3000.0)]

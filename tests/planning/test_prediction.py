@@ -158,13 +158,6 @@ def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess()
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
 
 
-def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common():
-    one, other = vt.predictive_inputs(unsaid()), vt.predictive_inputs(unsaid(length_mm=300))
-    assert np.array_equal(one.draw(50, 7)[B], one.draw(50, 7)[B])
-    assert np.array_equal(one.draw(50, 7)[N], other.draw(50, 7)[N])
-    assert not np.array_equal(one.draw(50, 7, ["guess of B"])[B], other.draw(50, 7, ["guess of B"])[B])
-
-
 def test_a_fit_from_python_is_believed_as_its_file_is():
     found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
     n, draws = found["n"], vt.predictive_inputs(unsaid(**VINE), None, found).draw(20_000, 1)[N]
