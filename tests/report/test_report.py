@@ -17,7 +17,6 @@ from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, number
 from PIL import Image
 
 from vinetrack.diagnosis.result import PROBABILITIES, Candidate, Diagnosis, EffectPower, Power
-from vinetrack.effects import catalogue
 from vinetrack.figures.model_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import SECTIONS, figures_of
 from vinetrack.figures.style import render
@@ -181,17 +180,6 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
     assert inner <= set(ids)
     bare = {"verdict": verdict, "effects": [], "answer_set": [], "rounds": []}
     assert heading(page(diagnosis=read(bare))).startswith(verdict)
-
-
-def test_upper_limits_are_in_the_displayed_unit():
-    found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
-    assert build.upper_limits(found, {}) == {("leak", "k"): "2.50 kPa"}
-    unfitted = candidate("pressure_drive", 1.0, numbers=[], largest={"pressure_drive.k": 1.0})
-    assert build.upper_limits([Candidate.from_json(unfitted)], catalogue()) == {("pressure drive", "k"): "1.00 SI"}
-    (kappa,) = catalogue()["moving_average"].parameters
-    unfitted = candidate("moving_average", 1.0, numbers=[], largest={f"moving_average.{kappa.name}": 2.0})
-    (limit,) = build.upper_limits([Candidate.from_json(unfitted)], catalogue())
-    assert limit[1] == kappa.symbol
 
 
 def test_next_trials_have_their_pressure_in_the_unit_of_the_sheet():
