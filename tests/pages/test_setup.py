@@ -127,17 +127,6 @@ def test_a_header_names_columns_and_units_and_rows_are_those_of_their_clips(mark
     assert notes(text, at_column) == 0
 
 
-def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_they_are_pasted():
-    assert changed("name pressure_psi payload_g\nlate 5.3 5\nd15_24kPa_1 3.5 0\nd15_30kPa_1 4.5 20") == EXPECTED
-    expected = {(2, "pressure_kPa"): "36", (2, "payload_g"): "5", (0, "pressure_kPa"): "24", (0, "payload_g"): "0"}
-    assert changed("late\t36\t5\nd15_24kPa_1\t24\t0\n", 0, "pressure_kPa") == expected
-    expected = {(1, "pressure_kPa"): "24", (1, "payload_g"): "0", (2, "pressure_kPa"): "30", (2, "payload_g"): "20"}
-    assert changed("24\t0\n30\t20", 1, "pressure_kPa") == expected
-    expected = {(draft.SHARED_ROW, "pressure_kPa"): "1000", (0, "pressure_kPa"): "24"}
-    assert changed("1000\n24\n", draft.SHARED_ROW, "pressure_kPa") == expected
-    assert changed("pressure\n24", 1, "diameter_mm") == {(1, "pressure_kPa"): "24"}
-
-
 def test_sentences_above_the_table_of_notes_are_left_out_and_short_headings_known():
     prose = "bench, sat 28 nov, level but for d15_24kPa_1 (down)\nno payload yet, pressure from the big regulator\n"
     table = "clip    psi   payload_g\nd99_1   9    1\nlate   5.3   5\nd15_24kPa_1   3.5  0\nd15_30kPa_1   4.5   20"
