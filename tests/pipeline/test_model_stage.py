@@ -70,18 +70,6 @@ def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_
     np.testing.assert_array_equal(pairs[0][1].lead_position_m, by_hand["position_m"].to_numpy())
 
 
-def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path):
-    time_s = np.arange(20) / 1000
-    brought = {"time_s": time_s, "position_m": time_s / 10, "pressure_kPa": 20 - 100 * time_s}
-    pd.DataFrame(brought).to_csv(tmp_path / "a.csv", index=False)
-    (tmp_path / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
-    succeed("trials", tmp_path, tmp_path / "results")
-    ((_, track),) = measured_trials(read_experiment(tmp_path), Results(tmp_path / "results"))
-    assert track.lead_position_systematic_m is None
-    assert track.pressure_Pa is not None
-    np.testing.assert_allclose(track.pressure_Pa, 1e3 * brought["pressure_kPa"])
-
-
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
@@ -150,16 +138,6 @@ def test_a_sheet_without_recordings_says_what_was_guessed(folder):
     assert origins["systematic error of positions"] == ("0.08 mm", "guess: positions by a scale, lens uncorrected")
     assert [entry.effect for entry in power.effects] == ["leak", "air_drag"]
     assert list(power.not_testable) == ["payload_drag"]
-
-
-def test_a_plan_names_every_frame_rate_and_the_yield_pressure_that_it_assumes(folder):
-    sheet = (
-        "trial,diameter_mm,thickness_um,length_mm,pressure_psi,capture_fps\na,24,200,200,4,1000\nb,24,200,200,5,4000\n"
-    )
-    (folder / "rates.csv").write_text(sheet)
-    told = {entry.name: entry.value for entry in power_of_target(PowerRequest(folder / "rates.csv")).inputs}
-    assert told["frame rate"] == "1000 to 4000 /s"
-    assert told["P_y of 24mm-200um-200mm"].startswith("0.435 psi")
 
 
 def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder):

@@ -15,8 +15,7 @@ from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures import registry as drawn
-from vinetrack.figures.registry import SECTIONS, FigureTables, draw, figures_of, label_conditions
-from vinetrack.figures.style import render
+from vinetrack.figures.registry import FigureTables, label_conditions
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
@@ -153,20 +152,6 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     assert all_steps(results, nearly)["rms_in_sample_m"].iloc[-1] == nearly["rms_in_sample_m"][0], "as this run has it"
     read = replace(read_diagnosis(results), ladder=now)
     assert len(drawn.DiagnosisTables(read, tables={"steps.csv": all_steps(results, now)}).ladder) == 2
-
-
-def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):
-    for verdict in VERDICTS:
-        results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
-        found = tables_of(results, conditions())
-        assert found is not None
-        pictures = {name: figure for name in figures_of(*SECTIONS[2:-1]) if (figure := draw(name, found))}
-        assert set(pictures) == {"ladder", "before_after", "where", "candidates"}
-        assert all(len(getattr(found, figures_of(*SECTIONS[2:-1])[name].data)) > 0 for name in pictures)
-    assert all(render(figure, ["svg"])["svg"] for figure in pictures.values())
-    for name, content in (("none", None), ("refused", refused())):
-        assert tables_of(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, drawn.DiagnosisTables()) for name in figures_of(*SECTIONS[2:-1]))
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
