@@ -70,6 +70,18 @@ def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_
     np.testing.assert_array_equal(pairs[0][1].lead_position_m, by_hand["position_m"].to_numpy())
 
 
+def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path):
+    time_s = np.arange(20) / 1000
+    brought = {"time_s": time_s, "position_m": time_s / 10, "pressure_kPa": 20 - 100 * time_s}
+    pd.DataFrame(brought).to_csv(tmp_path / "a.csv", index=False)
+    (tmp_path / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
+    succeed("trials", tmp_path, tmp_path / "results")
+    ((_, track),) = measured_trials(read_experiment(tmp_path), Results(tmp_path / "results"))
+    assert track.lead_position_systematic_m is None
+    assert track.pressure_Pa is not None
+    np.testing.assert_allclose(track.pressure_Pa, 1e3 * brought["pressure_kPa"])
+
+
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
