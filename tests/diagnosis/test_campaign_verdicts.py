@@ -1,6 +1,5 @@
 """Verdicts on whole campaigns of known truth, by two simulators. Seeds from 7000 are used here alone."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.ladder import align_trials, not_better
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
-from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
+from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE
 from vinetrack.effects import catalogue
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import values_for_trial
@@ -315,11 +314,6 @@ def test_trials_that_only_the_initial_model_misses_by_far_are_no_reason_to_look_
         again = {note.code: note.facts for note in diagnosed(fit, FEW[:1]).notes}
         assert ("far_off" in again) == told
         assert again["not_in_the_fit"] == {"names": ["still"], "reason": "it stands"}
-
-
-def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted):
-    written = json.dumps(depleted.to_json(), default=float)
-    assert json.dumps(Diagnosis.from_json(json.loads(written)).to_json(), default=float) == written
 
 
 @pytest.mark.slow

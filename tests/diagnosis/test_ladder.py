@@ -149,15 +149,6 @@ def test_a_model_that_cannot_be_followed_costs_its_own_predictions_alone(fits, m
     assert analysis.predictions(fits[1], fits[1]) == []
 
 
-def test_of_a_single_condition_nothing_can_be_left_out(pairs):
-    found = vt.fit(vt.base_model(), pairs[:3], fixed=["n"])
-    table = ladder([found], [""])
-    assert math.isfinite(table["rms_in_sample_m"].iloc[0])
-    assert math.isnan(table["rms_left_out_m"].iloc[0])
-    assert math.isnan(table["excess_left_out_m"].iloc[0])
-    assert table.attrs["notes"]
-
-
 def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs)
 

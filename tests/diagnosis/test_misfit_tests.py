@@ -18,7 +18,6 @@ from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference import systematics
 from vinetrack.inference.fit_result import EXPONENT
-from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
@@ -206,27 +205,6 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
     assert abs(said.fits[-1]["P_s"].value - P_S_TRUE) < 100.0
 
 
-def test_a_fit_is_the_same_once_its_curves_are_made_again():
-    """Of trials whose tail rubs. Of many trials a search lets go of curves."""
-    model, pairs = vt.base_model(), hidden({"tail_friction.mu_w": 1.0}, seed=7270)
-    fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]))
-    light = selection.without_curves(fit)
-    assert not light.trials
-    of_light, of_fit = (relative_residuals(one.predictor, one.solution) for one in (light, fit))
-    assert of_light.tolist() == of_fit.tolist()
-    steps = fit.predictor.steps.copy()
-    again = selection.with_curves(light)
-    assert np.array_equal(fit.predictor.steps, steps)
-    assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
-    for trial, before_trial in zip(again.trials, fit.trials, strict=True):
-        assert np.array_equal(trial.residual_m, before_trial.residual_m)
-        assert np.array_equal(trial.predicted_velocity_m_s, before_trial.predicted_velocity_m_s)
-    # Steps of differences differ, and with them the one frame in which growth ends.
-    for columns, before_columns in zip(again.solution.columns, fit.solution.columns, strict=True):
-        apart, whole = (np.linalg.norm(each, axis=0) for each in (columns - before_columns, before_columns))
-        assert np.all(apart <= 0.02 * whole)
-
-
 def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:
     """Trials of two vines, grown with a tail that may go slack or not, stated as taut."""
     told = {"growth_angle_rad": angle_rad, "tail_slack": tail_slack, "payload_kg": 1e-3 * payload_g}
@@ -262,10 +240,3 @@ def test_a_model_that_misses_one_trial_by_far_is_not_adequate():
     diagnosis = vt.diagnose(vt.fit(vt.base_model(), pairs), advice=False)
     assert diagnosis.verdict != "adequate"
     assert [note.facts["names"] for note in diagnosis.notes if note.code == "far_off"] == [[trial.name]]
-
-
-def test_a_diagnosis_names_the_trials_of_the_sheet_that_it_could_not_use(monkeypatch):
-    pairs, why = pairs_of(campaigns.grown(campaigns.sheet(), 301)), "its trace has another clock"
-    monkeypatch.setattr("vinetrack.diagnosis.diagnose.pairs_of", lambda *_: (pairs, {"gone": why}))
-    said = vt.diagnose(pairs, candidates=("tail_friction",), ladder=False, advice=False)
-    assert [(note.facts["names"], note.facts["reason"]) for note in said.notes] == [(["gone"], why)]

@@ -148,19 +148,6 @@ def test_a_condition_that_is_missed_in_every_replicate_is_far_off_though_most_tr
     assert misfit_tests.exceeds_slow_errors(fit) == (replicates_missed == 2)
 
 
-def test_scores_that_a_specimen_shares_count_once():
-    """Ten specimens of four trials each, whose scores are the same, tell as much as ten trials."""
-    draw = np.random.default_rng(8)
-    groups = [f"tube {k // 4}" for k in range(40)]
-    shared = np.repeat(draw.standard_normal((10, 300)), 4, axis=0)
-    informations = np.tile(np.eye(300), (40, 1, 1))
-    of, alone = summed(shared, informations, groups), summed(shared, informations)
-    assert of.degrees == 9
-    # The sum of ten independent fours has the standard deviation 4 √10.
-    assert np.mean(of.robust_sigma * 40) == pytest.approx(4 * math.sqrt(10), rel=0.1)
-    assert np.mean(alone.robust_sigma * 40) < 0.6 * np.mean(of.robust_sigma * 40)
-
-
 @pytest.mark.parametrize(("trials", "scatter"), [(12, 0.0), (8, 5.0)])
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter):
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
