@@ -272,13 +272,6 @@ def test_it_sticks_and_slips_never_starts_below_p_s_and_released_above_it_leaves
         np.testing.assert_array_equal(simulated(LEVEL, {"static_yield.P_s": P_s}, FINE).lead_position_m, free)
 
 
-@pytest.mark.parametrize("first", [{"perspective.k": 0.2}, {"tail_stretch.compliance": 5e-8}], ids=["lens", "stretch"])
-def test_the_scale_stretches_last(first):
-    seen = simulated(LOADED, first, FINE).observed_position_m
-    got = simulated(LOADED, {**first, "length_scale.eps": 0.05}, FINE).observed_position_m
-    np.testing.assert_allclose(got, 1.05 * seen, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("stated", "true", "sizes"),
     [

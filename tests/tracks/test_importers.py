@@ -12,7 +12,6 @@ from vinetrack.core.problems import InputError
 from vinetrack.core.records import Trial, plain_track, with_flag
 from vinetrack.tracks import importers
 from vinetrack.tracks.importers import read_pressure_trace, read_track
-from vinetrack.tracks.position_noise import rejected_points_note
 
 TIMES = np.arange(8) / 100
 POSITIONS = 0.5 * 9.81 * TIMES**2
@@ -62,12 +61,6 @@ def test_a_track_of_a_results_folder_keeps_its_errors_and_flags(tmp_path):
     assert {*track.lead_position_sigma_m, *track.lead_position_systematic_m} == {2e-5, 3e-5}
     assert track.pressure_Pa is None
     assert len(track.notes) == 1
-
-
-def test_frames_before_those_chosen_are_no_outliers(tmp_path):
-    track = read_track(write(tmp_path, "time_s,position_m\n" + rows(TIMES, POSITIONS)), frames_used=(2, 6))
-    assert track.usable.tolist() == [False, False, True, True, True, True, True, False]
-    assert rejected_points_note({"a": track}) == ""
 
 
 def test_blank_pressures_are_interpolated_and_a_frame_without_a_point_has_no_position(tmp_path):
