@@ -15,7 +15,7 @@ from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures import registry as drawn
-from vinetrack.figures.registry import FigureTables, label_conditions
+from vinetrack.figures.registry import FigureTables
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
@@ -152,19 +152,6 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     assert all_steps(results, nearly)["rms_in_sample_m"].iloc[-1] == nearly["rms_in_sample_m"][0], "as this run has it"
     read = replace(read_diagnosis(results), ladder=now)
     assert len(drawn.DiagnosisTables(read, tables={"steps.csv": all_steps(results, now)}).ladder) == 2
-
-
-def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
-    for effects in (["air_drag"], []):
-        results = folder(tmp_path / str(len(effects)), diagnosis(effects=effects))
-        tables = FigureTables(results.folder, ())
-        described = conditions().assign(pressure_kPa=24.0)
-        table = pd.DataFrame({"condition": ["slow", "fast"], "model": "base"})
-        vars(tables).update(trials=described, comparison=label_conditions(table, described))
-        joined = tables.trajectories["slow"]
-        assert ("model_after_m" in joined) == bool(effects)
-        if effects:
-            assert np.allclose(joined["model_after_m"], joined["lead_position_m"], rtol=0, atol=1e-12)
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.
