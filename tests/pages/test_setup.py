@@ -148,16 +148,6 @@ def test_cells_of_notes_may_have_units_and_headings_further_words():
     assert notes("clip\tpressure\nlate\t5 furlong") == 1
 
 
-def test_an_empty_column_takes_the_unit_of_the_notes_and_a_bare_number_that_of_the_others():
-    table = "late\t5.3 psi\nd15_24kPa_1\t3.5"
-    assert changed(table, 0, "pressure_kPa") == {(2, "pressure_psi"): "5.3", (0, "pressure_psi"): "3.5"}
-    rows = [ROWS[0], ROWS[1] | {"pressure_kPa": "30"}, ROWS[2]]
-    placed, _ = draft.place_block(table, COLUMNS, rows, 0, "pressure_kPa")
-    assert placed == [(2, "pressure_kPa", "36.5422"), (0, "pressure_kPa", "24.1317")]
-    placed, told = draft.place_block("d15_30kPa_1\t30", COLUMNS, rows, 0, "pressure_kPa")
-    assert (placed, len(told)) == ([], 1)  # it stands there already; the two others have no line
-
-
 def test_what_matches_nothing_is_named_and_changes_nothing():
     text = "clip\tpressure_kPa\tcolour\nd15_24kPa_1\t24\tred\nd99_1\t99\tblue"
     assert changed(text) == {(0, "pressure_kPa"): "24"}
