@@ -23,6 +23,12 @@ from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_
 from vinetrack.pipeline.workflow import model_problems
 from vinetrack.video.survey import in_no_row
 
+CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
+PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
+VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
+PSI = 6894.757293168361
+NUMBERS = [column for column in COLUMNS.values() if column.kind == "number" and other_units(column.name)]
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -347,9 +353,6 @@ def test_names_in_the_settings_are_looked_up(folder):
         assert found == [("experiment.yaml", column) for column in columns], settings
 
 
-CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
-
-
 def read(tmp_path: Path, text: str) -> ExperimentSettings:
     (tmp_path / "experiment.yaml").write_text(text, encoding="utf-8")
     return read_experiment_settings(tmp_path / "experiment.yaml")
@@ -547,9 +550,6 @@ def test_the_name_of_a_condition_shows_what_differs():
     assert [trial.condition for trial in named] == [base, "12mm-100um-280mm_28kPa_0g"]
 
 
-PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
-
-
 def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10) -> Path:
     """Ten trials of one vine at five rising pressures."""
     (folder / "a.csv").write_text(TRACK)
@@ -589,9 +589,6 @@ def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_pat
         assert [problem.code for problem in found if problem.column == (column or "order")] == codes
 
 
-VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
-
-
 def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_path):
     folder = write(two_vines(tmp_path), GOOD, "chamber_l: 2\nmodel: [pressure_drive, gravity, leak]\n")
     planned = planned_sheet(folder)
@@ -613,9 +610,6 @@ def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tm
     planned = planned_sheet(tmp_path / "ideas.csv")
     assert ([trial.name for trial in planned.trials], planned.folder) == (["a"], tmp_path)
     assert [problem.column for problem in planned.problems] == ["payload_gr"]
-
-
-PSI = 6894.757293168361
 
 
 def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
@@ -647,9 +641,6 @@ def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_cou
         assert trial.yield_pressure_Pa == pytest.approx(3000, rel=1e-3)
     with pytest.raises(ExperimentError):
         one(tmp_path, "yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n", yield_pressure_kPa=None)
-
-
-NUMBERS = [column for column in COLUMNS.values() if column.kind == "number" and other_units(column.name)]
 
 
 @pytest.mark.parametrize("column", NUMBERS, ids=lambda column: column.name)

@@ -21,6 +21,11 @@ from vinetrack.pages.local_page import PageServer
 from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, ruler_in, write_templates
 from vinetrack.video.axis import axis_through
 
+SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
+SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
+FILLED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+OURS = {"X-Vinetrack": "setup"}
+
 
 def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of_their_numbers(tmp_path):
     names = "run 10.mp4,run 2.MOV,notes.txt,.hidden.mp4,board.png,calibration/board.mp4,two/1.png,two/2.png"
@@ -53,10 +58,6 @@ def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_ar
     assert [draft.columns_from_names([name]) for name in NAMES] == [[cells] for cells in NAMES.values()]
     assert draft.columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
     assert draft.columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
-
-
-SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
-SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
 
 
 def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_its_cells(tmp_path):
@@ -207,9 +208,6 @@ def sent(folder: Path, **more) -> dict:
     return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
 
 
-FILLED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
-
-
 def problems(folder: Path, **more) -> list[dict]:
     return draft_problems(folder, draft_from_json(folder, sent(folder, **more)))["problems"]
 
@@ -246,9 +244,6 @@ def test_a_new_folder_is_unsaved_and_a_sheet_that_is_there_is_shown_with_its_unk
     assert state["kept"] == ["trial", "video", "note"]
     assert state["sheet"]["rows"][0] == {"trial": "old", "video": "d15 24kPa 1.mp4", "note": "of Monday"}
     assert state["sheet"]["rows"][1]["video"] == "d15 30kPa 1.mp4"
-
-
-OURS = {"X-Vinetrack": "setup"}
 
 
 @pytest.fixture
