@@ -20,7 +20,7 @@ from vinetrack.planning.prediction import grown
 from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 
 EDGE, TENSION, LEAST_TENSION = "speed of the leading edge", "tension of the tail", "least tension of the tail"
-FAST = {name: str(value) for name, value in motions.FAST_VINE.items()}
+KNOWN = {"yield_pressure_sigma_kPa": 0}
 SIZES = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 VINE = dict(zip(SIZES, (24, 200, 280, 28), strict=True))
 B, N = "eversion_damping.B", "eversion_damping.n"
@@ -31,13 +31,8 @@ EXACT = vt.StatedValues(n=0.37, spreads=(0.0, 0.0))
 
 
 def trial(**values: object) -> Trial:
-    said = {**FAST, "yield_pressure_sigma_kPa": "0", **{name: str(value) for name, value in values.items()}}
-    return vt.planned_trial(said).trials[0]
-
-
-def unsaid(**values: object) -> Trial:
-    said = {**dict(zip(SIZES, (25, 100, 400, 62), strict=True)), **values}
-    return vt.planned_trial({name: str(value) for name, value in said.items()}).trials[0]
+    """The paper's fast vine, unless it is said otherwise."""
+    return vt.planned_trial({name: str(value) for name, value in {**motions.FAST_VINE, **values}.items()}).trials[0]
 
 
 def certain(one: Trial, B: float) -> guess.PredictiveInputs:
@@ -50,7 +45,7 @@ def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
     At 99 % the film weighs 0.04 g: less than a quarter of the gas, 0.1 g, which is the floor of what moves. With it
     Eq. (2) gives 53.8 m/s there, 55 without.
     """
-    fast = trial(yield_pressure_kPa=3)
+    fast = trial(**KNOWN, yield_pressure_kPa=3)
     B = damping_prior(fast.diameter_m, fast.thickness_m)
     assert pytest.approx(3.3, abs=0.05) == B
     inputs, places = certain(fast, B), (0.90, 0.95, 0.98, 0.99)
@@ -62,7 +57,7 @@ def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
 def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_gives():
     """m ẍ = F with m = λ(L − x/2): ẋ² = −(4F/λ) ln(1 − y/L), level, F = ½(P − P_y)A."""
     film, force = 1200 * math.pi * 25e-3 * 100e-6, 0.5 * 60e3 * math.pi * 25e-3**2 / 4
-    level = certain(trial(yield_pressure_kPa=2, growth_angle_deg=90), 1e-9)
+    level = certain(trial(**KNOWN, yield_pressure_kPa=2, growth_angle_deg=90), 1e-9)
     prediction = vt.predict_vine(level, samples=2, at_fraction=0.8)
     assert prediction["speed of the tail"].median == pytest.approx(math.sqrt(4 * force / film * math.log(5)), rel=2e-3)
     assert prediction[EDGE].median == pytest.approx(prediction["speed of the tail"].median / 2)
@@ -71,7 +66,7 @@ def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_
 
 def test_the_tension_is_what_the_tip_leaves_of_the_drive():
     """T₁ = ½(P − P_y)A − ½Bẋⁿ all along: 35.6 g pull the tail slack at 14 kPa, in the equation."""
-    one = trial(**{**VINE, "pressure_kPa": 14}, yield_pressure_kPa=3, payload_g=35.6)
+    one = trial(**KNOWN, **{**VINE, "pressure_kPa": 14}, yield_pressure_kPa=3, payload_g=35.6)
     prediction = vt.predict_vine(certain(one, 6.44), samples=2)
     curve, force = prediction.curve, 0.5 * 11e3 * math.pi * 24e-3**2 / 4
     expected = force - 0.5 * 6.44 * curve["tail_velocity_m_s"] ** 0.37
@@ -83,10 +78,10 @@ def test_the_tension_is_what_the_tip_leaves_of_the_drive():
 
 def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
-    inputs = certain(vt.planned_trial(FAST).trials[0], 3.3)
+    inputs = certain(trial(), 3.3)
     prediction = vt.predict_vine(inputs, samples=1500)
     drawn_Pa = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
-    alone = [certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3) for P_y in drawn_Pa]
+    alone = [certain(trial(**KNOWN, yield_pressure_kPa=P_y / 1e3), 3.3) for P_y in drawn_Pa]
     speeds = [vt.predict_vine(one, samples=1).quantities[0].median for one in alone]
     assert [prediction[EDGE].high, prediction[EDGE].median, prediction[EDGE].low] == pytest.approx(speeds, rel=2e-3)
     (share,) = prediction.shares
@@ -94,7 +89,7 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain():
 
 
 def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time():
-    inputs = vt.predictive_inputs(vt.planned_trial(FAST).trials[0])
+    inputs = vt.predictive_inputs(trial())
     prediction = vt.predict_vine(inputs, samples=300)
     moved, _ = grown(inputs.model, *inputs.drawn_trials(300, 1))
     there = prediction.curve.iloc[60]
@@ -118,41 +113,41 @@ def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> guess.FitNumbers:
 
 def test_persons_and_sheets_that_contradict_a_fit_go_before_it_and_the_fit_before_the_guess():
     numbers = fitted()
-    assert vt.predictive_inputs(unsaid(**VINE), vt.StatedValues(B=5.0), numbers).medians[B] == 5.0
-    assert vt.predictive_inputs(unsaid(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
-    assert vt.predictive_inputs(unsaid()).medians[B] == pytest.approx(3.32, abs=0.005)
-    assert vt.predictive_inputs(unsaid(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
-    assert vt.predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
+    assert vt.predictive_inputs(trial(**VINE), vt.StatedValues(B=5.0), numbers).medians[B] == 5.0
+    assert vt.predictive_inputs(trial(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
+    assert vt.predictive_inputs(trial()).medians[B] == pytest.approx(3.32, abs=0.005)
+    assert vt.predictive_inputs(trial(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
+    assert vt.predictive_inputs(trial(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 
 
 def test_a_stated_scatter_of_the_pressure_goes_before_that_of_a_fit():
-    told = [unsaid(**VINE, pressure_sigma_kPa=2), unsaid(**VINE)]
+    told = [trial(**VINE, pressure_sigma_kPa=2), trial(**VINE)]
     widths = [np.std(vt.predictive_inputs(one, None, fitted()).draw(4000, 1)[PRESSURE]) for one in told]
     assert widths == pytest.approx([2000.0, 0.02 * 28e3 * math.sqrt(3)], rel=0.35)
-    assert vt.predictive_inputs(unsaid(**VINE)).spreads == (0.01, 0.03)
+    assert vt.predictive_inputs(trial(**VINE)).spreads == (0.01, 0.03)
 
 
 def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three():
-    draws = vt.predictive_inputs(unsaid()).draw(40_000, seed=1)[YIELD]
+    draws = vt.predictive_inputs(trial()).draw(40_000, seed=1)[YIELD]
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
 
 
 def test_draws_have_the_covariance_of_the_fit_and_its_spreads_with_the_doubt_of_few_trials():
-    inputs = vt.predictive_inputs(unsaid(**VINE), vt.StatedValues(spreads=(0.0, 0.0)), fitted())
+    inputs = vt.predictive_inputs(trial(**VINE), vt.StatedValues(spreads=(0.0, 0.0)), fitted())
     draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
     # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
     expected = [[1e-4, -0.8e-4, 0.0], [-0.8e-4, 1e-4, 0.0], [0.0, 0.0, 1e-6]]
     assert found == pytest.approx(np.array(expected), abs=3e-6)
     # Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8).
-    inputs = vt.predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
+    inputs = vt.predictive_inputs(trial(**VINE), None, fitted(13, B_is_estimated=False))
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess():
-    inputs = vt.predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
+    inputs = vt.predictive_inputs(trial(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
     assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
     assert [(note.code, note.facts["vine"]) for note in inputs.notes] == [("B_carried_over", "24mm-200um-280mm")]
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
@@ -160,7 +155,7 @@ def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess()
 
 def test_a_fit_from_python_is_believed_as_its_file_is():
     found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
-    n, draws = found["n"], vt.predictive_inputs(unsaid(**VINE), None, found).draw(20_000, 1)[N]
+    n, draws = found["n"], vt.predictive_inputs(trial(**VINE), None, found).draw(20_000, 1)[N]
     assert (np.mean(draws), np.std(draws)) == pytest.approx((n.value, (n.high - n.low) / 3.92), rel=0.05)
 
 
@@ -225,7 +220,7 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_no_right_one(damping, factor,
 
 
 def predicted(said: vt.StatedValues | None = None, tail_slack: str = "taut", **values: object):
-    safe = unsaid(**{**SAFE, "yield_pressure_kPa": 3, **values})
+    safe = trial(**{**SAFE, "yield_pressure_kPa": 3, **values})
     return vt.predict_vine(vt.predictive_inputs(replace(safe, tail_slack=tail_slack), said), samples=60)
 
 
@@ -273,7 +268,7 @@ def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in_and_only_t
 
 
 def on_chamber(**values: object) -> Trial:
-    return unsaid(**{**VINE, "yield_pressure_kPa": 3, "chamber_l": 3.7, **values})
+    return trial(**{**VINE, "yield_pressure_kPa": 3, "chamber_l": 3.7, **values})
 
 
 def room(pressure_kPa: float = 62, **values: object) -> prediction.Room:
