@@ -52,11 +52,6 @@ TESTS = 16_827  # Lines of Python below tests/, lowered with them
 LET_PASS = (30, 0, 2)  # A figure or a format more is let pass: who adds it need not take out what he has not read
 
 HEAVY = {"matplotlib", "cv2", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
-HEAVY_AT_IMPORT = {
-    *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis"),
-    *("planning", "paper", "interface", "pages"),
-}
-"""Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 
 
 @cache
@@ -142,12 +137,6 @@ def test_no_modules_import_each_other_in_a_circle():
         for name in free:
             del users[name]
     assert not users
-
-
-def test_a_room_that_does_not_compute_starts_without_heavy_libraries():
-    quick = [path for path in FILES if room(path) not in HEAVY_AT_IMPORT]
-    late = [(path, name) for path in quick for name in imports(path, True) if name.split(".")[0] in HEAVY]
-    assert not late
 
 
 @pytest.mark.parametrize("module", ["vinetrack.cli.main", "vinetrack.pipeline.workflow"])

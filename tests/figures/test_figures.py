@@ -19,7 +19,11 @@ from vinetrack.figures.style import BLUE, MUTED, ORANGE, SKY, VERMILLION, look, 
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
-N = 0.4
+N, COUNT = 0.4, 40
+Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
+NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
+OFF_M = {"before": 8e-3, "after": 1e-3}
+NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
 REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
 
 
@@ -192,9 +196,6 @@ def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_len
 
 
 # The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames.
-COUNT = 40
-
-
 def tracking(n_along: int = 300, height: int = 60) -> Tracking:
     """An edge at 7 px a frame from frame 10 on; frame 20 is lost, 25 moved by hand, 26 retimed, 30 doubtful."""
     flag = np.array(["before_release"] * 10 + [""] * 30, dtype="<U64")
@@ -225,10 +226,6 @@ def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_
 
 
 # Figures of a diagnosis and of the paper's numbers, from tables written by hand.
-NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
-OFF_M = {"before": 8e-3, "after": 1e-3}
-
-
 def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis():
     (ax,) = figures.draw_ladder(ladder("", "reservoir_depletion")).axes
     assert ax.get_yscale() == "log"
@@ -298,9 +295,6 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
 
 
 # The learned force as a curve or a map, with units, and blank outside the range of the trials.
-Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
-
-
 def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been():
     curve = pd.DataFrame({**NOTHING, "lead_position_m": Y, "force_N": -Y, "sigma_N": 0.02, "trials": Y < 0.2})
     (ax,) = figures.draw_learned_force(pd.concat([curve.assign(condition=name) for name in ("", "a", "b")])).axes
@@ -324,9 +318,6 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error():
 
 
 # Figures for comparison with the paper, from tables written by hand: content, and nothing cut off.
-NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
-
-
 def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points():
     way, time_s = np.linspace(0, 1, 30), np.linspace(0, 1 / 7, 100)
     parts = []
