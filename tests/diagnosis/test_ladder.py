@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import diagnose, result
+from vinetrack.diagnosis import between_trials, diagnose, result
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.between_trials import Difference, between_fits, confounded, differences, significant
 from vinetrack.diagnosis.ladder import align_trials, compare, excess, highest_pressures, ladder, left_out_error, rms_of
@@ -273,6 +274,15 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
     assert "day" in result.answer_set
     size = {vine: number.value for vine, number in sizes["day"].items() if number.key == "day.gain"}
     assert size["day 2"] - size["day 3"] == pytest.approx(np.log(1.05 / 0.96), abs=0.025)
+
+
+@pytest.mark.parametrize("sd", ["B_sd", "pressure_sd_Pa", "gain_sd"])
+def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_deviation(trials, monkeypatch, sd):
+    forms = partial(between_trials.of_column, **{sd: 0.03})
+    monkeypatch.setitem(between_trials.BETWEEN, "day", forms)
+    known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
+    found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9)))
+    assert [len(each.terms) for each in found if each.name == "day"] == [1]
 
 
 @pytest.mark.slow
