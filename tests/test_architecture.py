@@ -5,7 +5,6 @@ import importlib
 import re
 import subprocess
 import sys
-from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -171,13 +170,6 @@ def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top
 def test_a_snakefile_has_rules_only():
     text = (PACKAGE / "pipeline" / "Snakefile").read_text(encoding="utf-8")
     assert not [line for line in text.splitlines() if line.startswith(("def ", "class ", "    def "))]
-
-
-def test_no_two_modules_and_no_two_test_files_share_a_name():
-    """Pytest imports test files by their name alone: the second of two would not be run. It knows each conftest.py."""
-    for paths in (FILES, (ROOT / "tests").rglob("*.py")):
-        names = Counter(path.stem for path in paths if path.stem != "conftest" and not path.stem.startswith("__"))
-        assert not [name for name, times in names.items() if times > 1]
 
 
 def test_a_benchmark_finds_what_it_imports():

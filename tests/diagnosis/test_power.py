@@ -14,7 +14,7 @@ from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import further_trials as advice
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.linear_power import planned_tests
-from vinetrack.diagnosis.result import PROBABILITIES, EffectPower, Power
+from vinetrack.diagnosis.result import Power
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.laboratory.campaigns import GroundTruth, Vine, campaign, grow
@@ -109,14 +109,6 @@ def test_the_size_of_an_effect_that_may_differ_between_vines_is_that_of_all_vine
     assert linear_power.score_ratio(tests, k, size, linear_power.noiseless_start(tests.fit)) == pytest.approx(
         1, abs=0.2
     )
-
-
-def test_probabilities_invert_sizes():
-    sizes = tuple(1 + 0.1 * norm.ppf(PROBABILITIES))
-    entry = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
-    for probability in (0.1, 0.5, 0.9):
-        assert entry.probability_at(entry.size_at(probability)) == pytest.approx(probability)
-    assert (entry.probability_at(0.1), entry.probability_at(3.0)) == (0.0, 1.0)
 
 
 def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():

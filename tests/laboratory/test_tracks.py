@@ -340,12 +340,6 @@ def test_lamps_flicker_by_what_is_left_after_the_exposure():
     assert np.delete(spectrum, 10).max() < 1e-3
 
 
-def test_same_seed_same_pictures_other_seed_others():
-    one, again, other = (renderer(replace(preset("demo"), camera=SMALL), seed=seed).frame(20) for seed in (4, 4, 5))
-    assert (one == again).all()
-    assert (one != other).mean() > 0.5
-
-
 def test_h264_holds_every_frame_at_the_rendered_levels_in_the_limited_range(tmp_path):
     scene = replace(preset("demo"), camera=Camera(width_px=320, height_px=128), encoding=Encoding(gop=8))
     shot = {"n_frames": 24, "capture_fps": 1069.0, "seed": 7}
