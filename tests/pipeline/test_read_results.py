@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from vinetrack.paper import motions
 from vinetrack.pipeline.analysis import all_steps, propose_effect, sheet_contradictions, with_contradictions
 from vinetrack.pipeline.planning_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
-from vinetrack.report import build
 from vinetrack.results import Results, ResultsError, read_diagnosis, read_fit, read_source_experiment
 
 
@@ -219,16 +217,3 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp
     write_json(results.diagnosis, contradicted.to_json())
     with pytest.raises(ResultsError, match="pressure_kPa"):
         propose_effect(None, tmp_path, print)
-
-
-def test_a_figure_is_shown_from_the_files_there_are(tmp_path):
-    def shown(name: str, limit: int, **files: str) -> str | bytes:
-        path = partial(Results(tmp_path).figure, name)
-        path(".svg").parent.mkdir(exist_ok=True)
-        for form, content in files.items():
-            path(f".{form}").write_text(content)
-        return build._picture(path, limit)
-
-    assert shown("both", 9, png="png", svg="<svg/>") == shown("alone", 9, svg="<svg/>") == "<svg/>"
-    assert shown("both", 5) == b"png"
-    assert shown("neither", 9, pdf="pdf") == b""

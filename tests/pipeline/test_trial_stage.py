@@ -217,18 +217,15 @@ def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentenc
 # Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused.
 N, WIDTH, HEIGHT = 60, 480, 120
 MM_PER_PX = 0.5
-
-
-def edge_px() -> np.ndarray:
-    """At rest for 20 frames, then 10 px a frame for 30, then at rest."""
-    return 40.0 + 10.0 * np.clip(np.arange(N) - 20, 0, 30)
+EDGE_PX = 40.0 + 10.0 * np.clip(np.arange(N) - 20, 0, 30)
+"""At rest for 20 frames, then 10 px a frame for 30, then at rest."""
 
 
 def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
     """An experiment of two filmed replicates, one of another condition and one that failed, and its results."""
     experiment, results = folder / "vines", folder / "out"
     experiment.mkdir(parents=True)
-    edge, time_s = edge_px(), np.arange(N) / 1000
+    edge, time_s = EDGE_PX, np.arange(N) / 1000
     write_bars(experiment / "a.mp4", edge, WIDTH, HEIGHT)
     rows = ["trial,video,capture_fps,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px"]
     trials = {"a": 24, "b": 24, "c": 30, "torn": 36}
@@ -319,7 +316,7 @@ def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop
 
 
 def test_a_clip_goes_from_before_to_after_the_motion_about_as_long_as_asked_at_a_rate_that_players_know():
-    shown, margin = clips.frames_to_show(pd.DataFrame({"edge_px": edge_px()})), clips.MARGIN_FRAMES
+    shown, margin = clips.frames_to_show(pd.DataFrame({"edge_px": EDGE_PX})), clips.MARGIN_FRAMES
     assert shown.start == 21 - margin
     assert 49 + margin <= shown.stop <= 51 + margin
     for n_frames in (10, 30, 200, 1000, 20_000):
