@@ -113,6 +113,13 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
         np.testing.assert_allclose(columns[:, 1:].sum(axis=1), columns[:, 0], rtol=0.02, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("name", "sizes"), [("supply_refill", 10 ** np.array([-1.25, -0.5, 0.25])), ("lens", [0.03, 0.2, 0.7])]
+)
+def test_finite_sizes_are_in_equal_ratios_where_the_plausible_range_spans_powers_of_ten(name, sizes):
+    np.testing.assert_allclose([shape.step for shape in misfit_tests.whole_shapes(catalogue()[name])], sizes)
+
+
 def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_has_one():
     assert [shape.group for shape in misfit_tests.shapes_of(FILM)] == [""]
     told = [("", ()), ("a", ("b",)), ("b", ("a",))]

@@ -18,6 +18,7 @@ from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference import systematics
 from vinetrack.inference.fit_result import EXPONENT
+from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.laboratory.campaigns import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
@@ -203,6 +204,19 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
     assert said.verdict == "missing"
     assert said.effects == ("static_yield",)
     assert abs(said.fits[-1]["P_s"].value - P_S_TRUE) < 100.0
+
+
+def test_a_fit_is_the_same_once_its_curves_are_made_again():
+    """Of trials whose tail rubs. Of many trials a search lets go of curves."""
+    fit = vt.fit(vt.base_model(), hidden({"tail_friction.mu_w": 1.0}, seed=7270))
+    light = selection.without_curves(fit)
+    of_light, of_fit = (relative_residuals(one.predictor, one.solution) for one in (light, fit))
+    again = selection.with_curves(light)
+    assert (of_light.tolist(), light.trials) == (of_fit.tolist(), ())
+    assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
+    for trial, before in zip(again.trials, fit.trials, strict=True):
+        assert np.array_equal(trial.residual_m, before.residual_m)
+        assert np.array_equal(trial.predicted_velocity_m_s, before.predicted_velocity_m_s)
 
 
 def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:

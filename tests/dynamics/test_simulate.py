@@ -205,6 +205,7 @@ def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):
     model: vt.Model = (vt.base_model() + "reservoir_depletion" + "air_drag").with_values(sizes)
     trials = [LOADED.trial(chamber_m3=3.7e-3), BARE.trial(chamber_m3=3.7e-3, growth_angle_rad=1.0)]
     times = [np.linspace(0.0, 0.3, 200)] * 2
+    assert (batch.shared_host(vt.base_model().effects), batch.shared_host(model.effects) is None) == (None, False)
     by_host = simulate_many(model, trials, times)
     monkeypatch.setattr(batch, "shared_host", lambda _: None)
     for others in (simulate_many(model, trials, times), simulate_many(model, trials, times, host=host_for(model))):

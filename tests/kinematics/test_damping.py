@@ -184,6 +184,16 @@ def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone():
         assert (-below, above) == pytest.approx((1.96 * N * 0.01,) * 2, rel=0.08)
 
 
+def test_points_of_a_vine_that_carries_no_slope_are_not_used():
+    points = campaign(default_rng(2))
+    few = points["vine"].eq("R3") & (points.groupby("vine").cumcount() >= 2)
+    points = points[~few].reset_index(drop=True)
+    left_out = fit_laws(points, resamples=20)["both_axes"]["left_out"]
+    marked = damping.mark_left_out(points, left_out)
+    assert marked["used"].tolist() == (marked["vine"] != "R3").tolist()
+    assert list(left_out) == ["R3"]
+
+
 def test_the_published_rule_is_fitted_from_its_own_columns():
     points = campaign(default_rng(0))
     points["x_ss_paper_m_s"] *= 1.2

@@ -241,7 +241,7 @@ def test_the_words_of_whole_pages_are_the_stored_ones():
     whole = replace(read(diagnosis("missing")), ladder=ladder("", "reservoir_depletion"), power=power())
     more = {"sections": [paper()]} | recordings("a") | result()
     adequate = read(diagnosis("adequate"))
-    limited = Candidate.from_json(candidate("air_drag", 1.0, largest={"k": 2500.0}))
+    limited = Candidate.from_json(candidate("air_drag", 1.0, largest={"k": 2500.0, "tau": np.nan}))
     (last,) = adequate.rounds
     seen = replace(adequate, power=power(), rounds=(replace(last, ranking=(*last.ranking, limited)),))
     pages = [page(diagnosis=whole, figures=figures, clip=CLIP, **more), page(diagnosis=seen)]
