@@ -24,6 +24,8 @@ PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
 ROWS = ({"trial": "a", "pressure_kPa": "28.5"}, {"trial": "b", "pressure_kPa": "14"})
 OUTSIDE = ("", ".", "..", "../a", "a/../../b", r"..\a", "/etc/passwd", r"\\server\share", "C:/a", r"c:\a", "C:a")
 NO_NAMES = ("", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n")
+NO_NUMBERS = ("nan", "inf", "-Infinity", "1e400", "1_000", "12 kPa", "١٢", "²", "0x10", "1,2,3", "1.2.3", "1 000")
+NO_NUMBERS += ("--1", "e5", ".", "−5", "1e", "=1", "", "  ", "\t")
 
 
 def table_of(tmp_path: Path, data: bytes) -> tables.Table:
@@ -79,10 +81,6 @@ def test_a_recording_named_as_a_table_is_not_read(tmp_path):
     (tmp_path / "film.mp4").write_bytes(bytes(11))
     with pytest.raises(InputError):
         tables.read_bytes(tmp_path / "film.mp4", most=10)
-
-
-NO_NUMBERS = ("nan", "inf", "-Infinity", "1e400", "1_000", "12 kPa", "١٢", "²", "0x10", "1,2,3", "1.2.3", "1 000")
-NO_NUMBERS += ("--1", "e5", ".", "−5", "1e", "=1", "", "  ", "\t")
 
 
 def test_numbers_and_what_is_none():

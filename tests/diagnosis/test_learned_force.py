@@ -28,6 +28,11 @@ GROWTH = learning.Domain((learning.Axis("growth", 0.0, 0.25, 12),))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
+DOMAINS = [
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 24),)),
+    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8, 8.0 / 1.3))),
+    learning.Domain((learning.Axis("time", 0.0, 0.4, 8, 0.4 / 0.1), learning.Axis("pressure", 1e4, 3e4, 5))),
+]
 
 
 def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value():
@@ -215,13 +220,6 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
             ended = (more.time_s >= more.end_time_s) | (less.time_s >= less.end_time_s)  # NaN: growth goes on
             off = (answer[:, k] - exact)[~ended]
             assert np.max(np.abs(off)) < 2e-3 * np.max(np.abs(exact))
-
-
-DOMAINS = [
-    learning.Domain((learning.Axis("growth", 0.0, 0.25, 24),)),
-    learning.Domain((learning.Axis("growth", 0.0, 0.25, 12), learning.Axis("speed", 0.0, 8.0, 8, 8.0 / 1.3))),
-    learning.Domain((learning.Axis("time", 0.0, 0.4, 8, 0.4 / 0.1), learning.Axis("pressure", 1e4, 3e4, 5))),
-]
 
 
 def learned(domain: learning.Domain, seed: int) -> learning.LearnedForce:

@@ -42,6 +42,15 @@ FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
 FINE = np.linspace(0, 0.15, 50)
 P_S = 8e3
 UP_AND_DOWN = (np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), np.array([2e3, 12e3, 1e3, 1e3, 11e3, 11e3]))
+FALL = f"""
+import numpy as np
+import vinetrack as vt
+from vinetrack.core.records import Trial
+trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
+model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
+model += vt.effects.own_effects(["{NAME}.py"])["{NAME}"]
+print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
+"""
 
 
 def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
@@ -96,17 +105,6 @@ def test_each_effect_and_all_together(name, vine):
     terms = audit.evaluate(model, trial, time, y, v)
     chamber = terms.pressure_Pa if name == "supply_refill" else None
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
-
-
-FALL = f"""
-import numpy as np
-import vinetrack as vt
-from vinetrack.core.records import Trial
-trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
-model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
-model += vt.effects.own_effects(["{NAME}.py"])["{NAME}"]
-print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
-"""
 
 
 @pytest.mark.slow

@@ -25,6 +25,11 @@ NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pres
 OFF_M = {"before": 8e-3, "after": 1e-3}
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
 REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
+EDGES = [
+    motion_figures.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
+    motion_figures.Edge("initial model", VERMILLION, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
+    motion_figures.Edge("with air drag", SKY, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
+]
 
 
 def fit(*B: float) -> dict:
@@ -160,13 +165,6 @@ def assert_nothing_is_cut_off(figure: Figure) -> None:
 
 def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
-
-
-EDGES = [
-    motion_figures.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
-    motion_figures.Edge("initial model", VERMILLION, np.array([0.0, 300.0]), np.array([0.0, 25.0]), 2.0),
-    motion_figures.Edge("with air drag", SKY, np.array([0.0, 210.0]), np.array([0.0, math.nan]), 1.4),
-]
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,11 @@ from vinetrack.interface import ERROR_COLUMNS
 from vinetrack.tracks.position_noise import rest_points
 
 STEP_M = 2e-3
+N_SLOW, P_Y_TRUE = 0.4, 6e3
+SLOW = Trial(
+    name="slow", capture_fps=200.0, diameter_m=0.024, thickness_m=2e-4, length_m=0.4, pressure_Pa=16e3,
+    pressure_sigma_Pa=160.0, yield_pressure_Pa=P_Y_TRUE, yield_pressure_sigma_Pa=2e3, growth_angle_rad=np.pi / 2,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -297,12 +302,6 @@ def test_watch_is_called_with_every_step_and_may_end_the_fit():
 
 
 # A tube pressurised during the recording: the trace alone shows when growth starts.
-
-N_SLOW, P_Y_TRUE = 0.4, 6e3
-SLOW = Trial(
-    name="slow", capture_fps=200.0, diameter_m=0.024, thickness_m=2e-4, length_m=0.4, pressure_Pa=16e3,
-    pressure_sigma_Pa=160.0, yield_pressure_Pa=P_Y_TRUE, yield_pressure_sigma_Pa=2e3, growth_angle_rad=np.pi / 2,
-)  # fmt: skip
 
 
 def slow_campaign() -> list[tuple[Trial, Track]]:

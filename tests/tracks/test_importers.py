@@ -22,6 +22,15 @@ MARKS = {n: (100 + 0.8 * SCALE * s, 250 - 0.6 * SCALE * s) for n, s in zip(FRAME
 CLOCK_S = np.arange(120) / 200
 TRACE_S = np.arange(12) * 2e-3 + 0.1
 PRESSURE_KPA = 20 + np.arange(12) ** 2 / 8.0
+OTHER_TIMES = {
+    "even to the digit": np.arange(100) / 500,
+    "not rounded": np.arange(100) / 1069,
+    "to the microsecond": np.round(np.arange(100) / 1069, 6),
+    "frames are missing": np.round(np.delete(np.arange(100), [40, 41]) / 1069, 3),
+    "uneven": np.round(np.cumsum(np.random.default_rng(2).uniform(0.5e-3, 1.5e-3, 100)), 3),
+    "few": np.array([0.0, 0.001, 0.002, 0.002, 0.003]),
+    "standing": np.zeros(20),
+}
 
 
 def write(folder: Path, text: str, name: str = "track.csv", encoding: str = "utf-8") -> Path:
@@ -265,17 +274,6 @@ def test_rounded_times_of_even_frames_become_even(rate_hz, digits):
             off_s = restored_s - true_s
             assert np.max(np.abs(off_s - off_s.mean())) < 0.1 * 10.0**-digits
             assert note
-
-
-OTHER_TIMES = {
-    "even to the digit": np.arange(100) / 500,
-    "not rounded": np.arange(100) / 1069,
-    "to the microsecond": np.round(np.arange(100) / 1069, 6),
-    "frames are missing": np.round(np.delete(np.arange(100), [40, 41]) / 1069, 3),
-    "uneven": np.round(np.cumsum(np.random.default_rng(2).uniform(0.5e-3, 1.5e-3, 100)), 3),
-    "few": np.array([0.0, 0.001, 0.002, 0.002, 0.003]),
-    "standing": np.zeros(20),
-}
 
 
 @pytest.mark.parametrize("name", OTHER_TIMES)

@@ -19,6 +19,8 @@ CAMERA = Camera(m_per_px=1 / 2400, focal_px=1500, k1=-0.2, k2=0.05, tilt_x_deg=4
 BOARD = Target(squares=(16, 5), square_m=0.020, marker_m=0.014, angle_deg=1.5)
 CHECKER = replace(BOARD, kind="checkerboard")
 AXIS = ((120.0, 150.0), (840.0, 175.0))
+NOT_THIS_BOARD = [{"squares": (14, 5)}, {"squares": (5, 16)}, {"dictionary": "DICT_6X6_250"}]
+NOT_THIS_BOARD += [{"dictionary": "DICT_9X9_250"}, {"marker_mm": 17.0}, {}]
 
 
 def stated(target: Target = BOARD, **changes) -> Charuco | Checkerboard:
@@ -162,10 +164,6 @@ def test_two_points_and_a_length(tmp_path):
     assert axis.m_per_px == pytest.approx(0.5e-3)
     assert axis.scale_rel_sigma == pytest.approx(math.sqrt(2) * 0.5 / 500)
     assert axis.position_m(np.array([[10, 20], [200, 120], [10, 520]])) == pytest.approx([0, 0.05, 0.25])
-
-
-NOT_THIS_BOARD = [{"squares": (14, 5)}, {"squares": (5, 16)}, {"dictionary": "DICT_6X6_250"}]
-NOT_THIS_BOARD += [{"dictionary": "DICT_9X9_250"}, {"marker_mm": 17.0}, {}]
 
 
 @pytest.mark.slow

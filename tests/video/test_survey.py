@@ -23,6 +23,24 @@ ROW = "24,200,280,28,3"
 SCALE = "capture_fps: 1000\ncalibration: {kind: mm_per_px, mm_per_px: 0.3}\n"
 FILMED = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px, mm_per_px: 0.24}\n"
 RIGHT = "12,100,140,36,3"
+BOARD = "calibration: {kind: checkerboard, image: board.png, squares: [5, 5], square_mm: 5}\n"
+NO_SCALES = {
+    "no scale": ("", None, "error calibration"),
+    "no picture": (BOARD, None, "error calibration.image"),
+    "picture of another size": (BOARD, (50, 50), "error calibration.image"),
+    "no board": (BOARD, (64, 96), "error calibration.image"),
+}
+FPS, SCALE_MM = 1069.0, 0.24
+VINE = Trial(name="a", diameter_m=0.012, length_m=0.14)
+FACTS = RecordingFacts(
+    trial="a", n_frames=100, capture_fps=FPS, playback_fps=60.0, mm_per_px=SCALE_MM, picture_mm=230.0, axis=None,
+    tube_width_mm=12.1, tube_width_sigma_mm=0.25, growth_mm=138.0,
+)  # fmt: skip
+
+
+SWAPPED = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
+SLOPES_DEG = [([0, 1, -2, 179, 1], ""), ([0, 1, -2, 60, 1], "d"), ([0, 1, -2, 60, -35], "de")]
+SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
 
 
 def write_clip(path: Path, n_frames: int = 40, index_first: bool = True, share: float = 1.0) -> None:
@@ -68,15 +86,6 @@ def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path, name)
     assert [(one.code, one.severity) for one in check_experiment(tmp_path, Surveyor())] == [("cut_short", "error")]
 
 
-BOARD = "calibration: {kind: checkerboard, image: board.png, squares: [5, 5], square_mm: 5}\n"
-NO_SCALES = {
-    "no scale": ("", None, "error calibration"),
-    "no picture": (BOARD, None, "error calibration.image"),
-    "picture of another size": (BOARD, (50, 50), "error calibration.image"),
-    "no board": (BOARD, (64, 96), "error calibration.image"),
-}
-
-
 @pytest.mark.parametrize("case", NO_SCALES)
 def test_what_gives_no_scale_is_reported_once(tmp_path, case):
     scale, size_px, found = NO_SCALES[case]
@@ -102,17 +111,6 @@ def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_pat
     assert check(tmp_path, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n") == found
 
 
-FPS, SCALE_MM = 1069.0, 0.24
-VINE = Trial(name="a", diameter_m=0.012, length_m=0.14)
-FACTS = RecordingFacts(
-    trial="a", n_frames=100, capture_fps=FPS, playback_fps=60.0, mm_per_px=SCALE_MM, picture_mm=230.0, axis=None,
-    tube_width_mm=12.1, tube_width_sigma_mm=0.25, growth_mm=138.0,
-)  # fmt: skip
-
-
-SWAPPED = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
-
-
 @pytest.mark.parametrize(
     ("trial", "scale", "grown_mm", "found"),
     [
@@ -130,10 +128,6 @@ SWAPPED = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
 def test_sizes_that_contradict_the_sheet_are_named_once(trial, scale, grown_mm, found):
     facts = replace(FACTS, tube_width_mm=12.1 * scale, tube_width_sigma_mm=0.25 * scale, growth_mm=grown_mm)
     assert [f"{problem.severity} {problem.column}" for problem in module.size_problems(trial, facts)] == found
-
-
-SLOPES_DEG = [([0, 1, -2, 179, 1], ""), ([0, 1, -2, 60, 1], "d"), ([0, 1, -2, 60, -35], "de")]
-SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
 
 
 @pytest.mark.parametrize(("slopes_deg", "named"), SLOPES_DEG)
