@@ -67,7 +67,8 @@ def test_both_fits_are_lines_of_slope_n_in_the_band_of_the_covariance():
     assert damping_figures.log_force_sigma(fit(1.0), "vine0", x_ss_m_s) == pytest.approx(expected)
 
 
-def scaling() -> dict:
+@pytest.mark.slow
+def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
     sizes = [6.0, 12.0, 18.0, 24.0]
     B = [math.exp(-3.0) * size**1.8 for size in sizes]
     power = {"slope": 1.8, "slope_95": [1.2, 2.4], "intercept": -3.0, "intercept_95": [-4.0, -2.0], "R2": 0.98}
@@ -75,14 +76,10 @@ def scaling() -> dict:
     family = {"along": "diameter_mm", "vines": [f"vine{i}" for i in range(4)], "sizes": sizes, "B": B}
     family |= {"B_95_total": [[0.9 * b, 1.1 * b] for b in B], "power": power, "line": power | {"slope": 0.3}}
     family |= {"refused": None}
-    return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
-
-
-@pytest.mark.slow
-def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
+    scaling = {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
     for n_vines in (4, 20):
         assert_nothing_is_cut_off(draw_damping_law(points(n_vines), damping(n_vines)))
-    assert_nothing_is_cut_off(draw_scaling(scaling()))
+    assert_nothing_is_cut_off(draw_scaling(scaling))
 
 
 def test_without_content_there_is_no_figure():

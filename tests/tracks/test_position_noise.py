@@ -81,12 +81,6 @@ def test_rounding_of_most_tracks_is_that_of_all_and_of_few_is_not():
     assert module.common_rounding_noise([]) == 0
 
 
-def test_noise_of_rounded_positions_is_not_kept_below_rounding():
-    """Most points are at rest: the median third difference is zero, and hides that the others are rounded."""
-    y = np.concatenate([np.full(200, 0.01), rounded(1)])
-    assert position_noise(np.arange(y.size) / 267, y, robust=True)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
-
-
 def experiment(rho: float = 0.0, seed: int = 20000) -> list[list[np.ndarray]]:
     """Times and positions of fast vines."""
     made = [record(scaled(2, 10.0), np.random.default_rng(seed + i), noise_m=NOISE_M, rho=rho) for i in range(8)]
@@ -305,17 +299,6 @@ def test_a_long_step_between_points_that_are_stated_to_be_unsure_is_no_dropped_f
     sigma_m = track.lead_position_sigma_m.copy()
     sigma_m[58:62] = stated_m
     assert bool(flags(correct_frames(replace(track, lead_position_sigma_m=sigma_m)))) is told
-
-
-def test_a_copy_changes_times_only_where_it_was_inserted():
-    clean = still_then_even()
-    for fault in (stale, inserted):
-        track = fault(clean, 70)
-        out = correct_frames(track)
-        assert flags(out) == {70: "duplicate"}
-        others = np.delete(out.time_s, 70) if fault is inserted else out.time_s
-        np.testing.assert_allclose(others, clean.time_s, atol=1e-12)
-        assert np.all(np.diff(out.time_s) > 0)
 
 
 @pytest.mark.parametrize("rows", [(70, 72), (70, 72, 74), range(60, 125, 5)], ids=["two", "three", "every fifth"])
