@@ -162,15 +162,6 @@ def test_what_matches_nothing_is_named_and_changes_nothing():
     assert draft.place_block(block, COLUMNS, rows, 0, "pressure_kPa")[0] == [(0, "pressure_kPa", "30")]
 
 
-def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
-    assert draft.read_block("24,5\n30,5") == [["24,5"], ["30,5"]]
-    assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
-    assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
-    assert draft.read_block("late,36") == [["late", "36"]]
-    notes = "clip      tube  psi\nC2031.MP4 B     1.5"  # A cell as long as its column has one blank behind it.
-    assert draft.read_block(notes) == [["clip", "tube", "psi"], ["C2031.MP4", "B", "1.5"]]
-
-
 RULERS = (
     {"px_mm": 5.2, "turned_deg": -63, "length_mm": 80, "ink": 220, "wood": 50, "size": (420, 460)},
     # Millimetres are lost between the pixels: the longer marks are found, and not twice as many as there are.
