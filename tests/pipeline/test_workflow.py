@@ -35,13 +35,6 @@ def planned(folder: Path, **config: object) -> workflow.WorkflowPlan:
     return workflow.make_plan({"experiment": str(folder), **config}, folder.parent)
 
 
-def test_results_are_named_after_the_last_part_of_the_path(tmp_path, monkeypatch):
-    folder = experiment(tmp_path / "2024")
-    monkeypatch.chdir(tmp_path)
-    for given in (2024, str(folder), f"{folder}/", f"{folder}/."):
-        assert workflow.make_plan({"experiment": given}, tmp_path).results == Path("results/2024")
-
-
 def test_trials_left_out_get_no_files_and_failed_ones_do_and_every_input_counts(tmp_path):
     rows = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\nc,gone.csv,12,100,300,9999,3,\n"
     folder = experiment(tmp_path / "v", rows)
