@@ -78,30 +78,23 @@ def conditions() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["trial", "vine", "condition", "condition_label"])
 
 
-def prediction(off_m: float, after: bool) -> pd.DataFrame:
-    """0.2 m in 0.1 s, of which the model before misses `off_m` at the end, the one after nothing."""
-    since_s = np.arange(-20, 101) * 1e-3
-    growth_m = 2.0 * np.maximum(since_s, 0)
-    table = pd.DataFrame({"time_s": since_s + RELEASE_S, "lead_position_m": ORIGIN_M + growth_m})
-    before_m = table["lead_position_m"] - off_m * growth_m / 0.2
-    return table.assign(model_before_m=before_m, model_after_m=table["lead_position_m"] if after else math.nan)
-
-
-def folder(path: Path, content: dict | None, after: bool = True) -> Results:
-    results = Results(path)
+def folder(path: Path) -> Results:
+    """Trials that grow 0.2 m in 0.1 s, of which the model before misses a part at the end, the one after nothing."""
+    results, content = Results(path), diagnosis()
     (path / "diagnosis" / "predictions").mkdir(parents=True)
     (path / "comparison").mkdir()
-    if content is not None:
-        (path / "diagnosis.json").write_text(json.dumps(content))
-    ladder("", *content.get("effects", []) if content else ()).to_csv(results.ladder, index=False)
-    for condition in ("slow", "fast"):
-        parts = []
+    (path / "diagnosis.json").write_text(json.dumps(content))
+    ladder("", *content["effects"]).to_csv(results.ladder, index=False)
+    since_s = np.arange(-20, 101) * 1e-3
+    growth_m = 2.0 * np.maximum(since_s, 0)
+    for condition, off_m in (("slow", 0.02), ("fast", 0.004)):
+        parts, before_m, seen_m = [], growth_m * (1 - off_m / 0.2), ORIGIN_M + growth_m
+        table = pd.DataFrame({"time_s": since_s + RELEASE_S, "lead_position_m": seen_m})
         for trial in (t for t, c in TRIALS.items() if c == condition):
-            table = prediction(0.02 if condition == "slow" else 0.004, after)
-            table.to_csv(results.predictions(trial), index=False)
-            since = {"time_s": table["time_s"] - RELEASE_S, "lead_position_m": table["lead_position_m"] - ORIGIN_M}
-            model = {"model_position_m": table["model_before_m"] - ORIGIN_M}
-            parts.append(pd.DataFrame({"trial": trial, **since, **model}))
+            said = table.assign(model_before_m=ORIGIN_M + before_m, model_after_m=seen_m)
+            said.to_csv(results.predictions(trial), index=False)
+            since = {"time_s": since_s, "lead_position_m": growth_m, "model_position_m": before_m}
+            parts.append(pd.DataFrame({"trial": trial, **since}))
         pd.concat(parts).to_csv(results.trajectories(condition), index=False)
     rows = [("v", name, low, low + 0.1, 0.011, 0.001) for name in ("slow", "fast", "") for low in (0.0, 0.1)]
     columns = ["vine", "condition", "from_m", "to_m", "mean_residual_m", "sigma_m"]
@@ -116,7 +109,7 @@ def tables_of(results: Results, trials: pd.DataFrame) -> drawn.DiagnosisTables |
 
 
 def test_predictions_count_from_release_and_origin(tmp_path):
-    trials = drawn.predicted_trials(folder(tmp_path / "r", diagnosis()), conditions())
+    trials = drawn.predicted_trials(folder(tmp_path / "r"), conditions())
     one = trials[trials["trial"] == "a"]
     assert one["time_s"].iloc[0] == pytest.approx(-0.02)
     end = one[["lead_position_m", "model_before_m", "model_after_m"]].iloc[-1]
@@ -124,7 +117,7 @@ def test_predictions_count_from_release_and_origin(tmp_path):
 
 
 def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_their_errors(tmp_path):
-    found = tables_of(folder(tmp_path / "r", diagnosis()), conditions())
+    found = tables_of(folder(tmp_path / "r"), conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa, 0deg"
     assert set(found.before_after["trial"]) == {"a", "b"}
@@ -136,7 +129,7 @@ def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_th
 
 
 def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_the_same_trials(tmp_path):
-    results = folder(tmp_path / "r", diagnosis())
+    results = folder(tmp_path / "r")
     former = ladder("", "leak").assign(model=["+".join(BASE), "+".join([*BASE, "leak"])])
     former.to_csv(results.ladder, index=False)
     now = former[1:].assign(added="").reset_index(drop=True)
