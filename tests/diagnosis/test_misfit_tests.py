@@ -254,3 +254,10 @@ def test_a_model_that_misses_one_trial_by_far_is_not_adequate():
     diagnosis = vt.diagnose(vt.fit(vt.base_model(), pairs), advice=False)
     assert diagnosis.verdict != "adequate"
     assert [note.facts["names"] for note in diagnosis.notes if note.code == "far_off"] == [[trial.name]]
+
+
+def test_a_diagnosis_names_the_trials_of_the_sheet_that_it_could_not_use(monkeypatch):
+    pairs, why = pairs_of(campaigns.grown(campaigns.sheet(), 301)), "its trace has another clock"
+    monkeypatch.setattr("vinetrack.diagnosis.diagnose.pairs_of", lambda *_: (pairs, {"gone": why}))
+    said = vt.diagnose(pairs, candidates=("tail_friction",), ladder=False, advice=False)
+    assert [(note.facts["names"], note.facts["reason"]) for note in said.notes] == [(["gone"], why)]

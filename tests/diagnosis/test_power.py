@@ -1,5 +1,6 @@
 """Power of trials: detectable sizes, simulated campaigns, further trials and the next experiment."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -80,6 +81,8 @@ def test_detectable_sizes_follow_the_normal_distribution_and_small_effects_linea
     assert not power["air_drag"].is_visible
     k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
     assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
+    written = json.dumps(power.to_json())
+    assert json.dumps(Power.from_json(json.loads(written)).to_json()) == written
 
 
 @pytest.mark.slow

@@ -191,22 +191,19 @@ def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_len
 
 
 # The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames.
-def tracking(n_along: int = 300, height: int = 60) -> Tracking:
+def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was():
     """An edge at 7 px a frame from frame 10 on; frame 20 is lost, 25 moved by hand, 26 retimed, 30 doubtful."""
     flag = np.array(["before_release"] * 10 + [""] * 30, dtype="<U64")
     flag[20], flag[25], flag[26], flag[30] = "lost", "corrected", "gap;retimed", "doubtful;gap"
     edge = np.maximum(np.arange(COUNT) - 10, 0) * 7.0 + 20
     edge[20] = np.nan
-    kymograph = np.where(np.arange(n_along)[None] < np.nan_to_num(edge)[:, None], 40, 180).astype(np.float32)
-    picture = np.full((height, n_along), 128, np.uint8)
+    kymograph = np.where(np.arange(300)[None] < np.nan_to_num(edge)[:, None], 40, 180).astype(np.float32)
+    picture = np.full((60, 300), 128, np.uint8)
     track = Track(np.arange(COUNT) / 1000, edge * 1e-3, np.full(COUNT, 1e-5), flag, edge)
     pictures = ((10, picture), (25, picture), (39, picture))
-    axis, rows = Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), np.arange(COUNT)
-    return Tracking(track, axis, kymograph, rows, pictures, 0.1, np.zeros(COUNT))
-
-
-def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was():
-    (sheet,) = draw_strip("a", tracking(), 1e-3).axes
+    axis, rows = Axis((0.0, 30.0), (299.0, 30.0), 20.0), np.arange(COUNT)
+    tracking = Tracking(track, axis, kymograph, rows, pictures, 0.1, np.zeros(COUNT))
+    (sheet,) = draw_strip("a", tracking, 1e-3).axes
     shown = {line.get_label(): line for line in sheet.lines if not line.get_label().startswith("_")}
     assert list(shown) == ["leading edge, N = 36", "flagged, N = 3", "corrected by hand, N = 1"]
     marks = (("flagged, N = 3", [math.nan, 132, 160], [20, 26, 30]), ("corrected by hand, N = 1", [125], [25]))

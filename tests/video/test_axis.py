@@ -229,16 +229,6 @@ def quarter(count: int = 25) -> Axis:
     return axis
 
 
-def test_two_points_are_the_straight_axis():
-    axis = axis_through([(10.0, 30.0), (100.0, 70.0)], 12.0)
-    assert not axis.bends
-    assert axis == Axis((10.0, 30.0), (100.0, 70.0), 12.0)
-    assert curves.axis_from_entry(curves.axis_entry(axis) | {"width_px": 12.0}) == axis
-    curve = replace(quarter(), width_px=14.0)
-    assert curves.axis_from_entry(curves.axis_entry(curve) | {"width_px": 14.0}) == curve
-    assert set(curves.axis_entry(axis)) == {"from_px", "to_px"}
-
-
 def test_positions_on_a_quarter_of_a_circle_are_its_arc_length():
     axis = quarter()
     assert axis.length_px == pytest.approx(RADIUS * math.pi / 2, rel=2e-3)
