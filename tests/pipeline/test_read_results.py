@@ -78,9 +78,9 @@ def conditions() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["trial", "vine", "condition", "condition_label"])
 
 
-def folder(path: Path) -> Results:
+def folder(path: Path, **changes: object) -> Results:
     """Trials that grow 0.2 m in 0.1 s, of which the model before misses a part at the end, the one after nothing."""
-    results, content = Results(path), diagnosis()
+    results, content = Results(path), diagnosis(**changes)
     (path / "diagnosis" / "predictions").mkdir(parents=True)
     (path / "comparison").mkdir()
     (path / "diagnosis.json").write_text(json.dumps(content))
@@ -143,6 +143,16 @@ def test_steps_of_earlier_runs_stand_before_those_of_a_model_that_was_saved_on_t
     assert all_steps(results, nearly)["rms_in_sample_m"].iloc[-1] == nearly["rms_in_sample_m"][0], "as this run has it"
     read = replace(read_diagnosis(results), ladder=now)
     assert len(drawn.DiagnosisTables(read, tables={"steps.csv": all_steps(results, now)}).ladder) == 2
+
+
+def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
+    table, described = pd.DataFrame({"condition": ["slow", "fast"], "model": "base"}), conditions()
+    for effects in (["air_drag"], []):
+        tables = FigureTables(folder(tmp_path / str(len(effects)), effects=effects).folder, ())
+        vars(tables).update(trials=described, comparison=table)
+        joined = tables.trajectories["slow"]
+        assert ("model_after_m" in joined) == bool(effects)
+        assert not effects or np.allclose(joined["model_after_m"], joined["lead_position_m"], rtol=0, atol=1e-12)
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.
