@@ -276,7 +276,6 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path):
 
 
 # From recordings: the truth is the motion that the virtual laboratory's camera filmed; the analysis sees files alone.
-FILMED_SHEET = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"
 SHARED = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
 FEW = "candidates: [tail_friction]\n"
 """Of recordings to report one candidate is enough; what the whole catalogue gives, `tests/diagnosis` asks."""
@@ -288,8 +287,6 @@ NATURE = GroundTruth(
     values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
     damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
 )  # fmt: skip
-TARGET = Target(squares=(14, 5), square_m=0.015, marker_m=0.011)
-WARPED = Camera(m_per_px=2.4e-4, k1=-0.08, tilt_y_deg=0.8)
 PLAIN = Camera(m_per_px=2.4e-4)
 GOOD = {"p30": 30, "p36": 36, "p42": 42}
 
@@ -304,8 +301,9 @@ class Filmed:
 
 
 def write_films(folder: Path, settings: str) -> None:
-    rows = [f"{name},videos/{name}.mp4,12,100,140,{kPa}" for name, kPa in GOOD.items()]
-    (folder / "trials.csv").write_text("\n".join([FILMED_SHEET, *rows, ""]))
+    header = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa\n"
+    rows = [f"{name},videos/{name}.mp4,12,100,140,{kPa}\n" for name, kPa in GOOD.items()]
+    (folder / "trials.csv").write_text("".join([header, *rows]))
     (folder / "experiment.yaml").write_text(SHARED + settings)
 
 
@@ -313,7 +311,8 @@ def write_films(folder: Path, settings: str) -> None:
 def filmed(tmp_path_factory):
     """Trials grown and filmed into an experiment folder, and analysed."""
     workdir = tmp_path_factory.mktemp("filmed")
-    folder, filming = workdir / "vines", Filming(camera=WARPED, target=TARGET)
+    folder, target = workdir / "vines", Target(squares=(14, 5), square_m=0.015, marker_m=0.011)
+    filming = Filming(camera=Camera(m_per_px=2.4e-4, k1=-0.08, tilt_y_deg=0.8), target=target)
     (folder / "videos").mkdir(parents=True)
     write_films(folder, BOARD + FEW)
     picture_target(filming, folder / "calibration" / "board.png", seed=5)
