@@ -214,7 +214,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
         (slope_of_row, known), *_ = residual_sums(strip, state, fit, slow)
         step = slope_of_row / (known + 0.02 * float(known.max()) + 1e-9)
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
-        lag, lead = _smooth_lag(state.lag + step, known)
+        lag, lead = _smooth_lag(state.lag + step, known, state.blur)
         state = replace(state, lag=lag, edge=state.edge - lead)
     # 16: frames from which the blur is estimated (chosen)
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
@@ -271,7 +271,7 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
     return seen, float(np.median(speed[fast]))
 
 
-def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
+def _smooth_lag(lag: Floats, weight: Floats, blur: float) -> tuple[Floats, float]:
     """Smooth the lag slightly along the rows, by weight, and subtract that of the foremost point; both are returned.
     The foremost point is the vertex of a parabola through the foremost third of the rows that show an edge: the
     smallest lag would follow their noise.
@@ -281,14 +281,14 @@ def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
     top = np.convolve(np.pad(lag * weight, 3, mode="edge"), kernel, mode="valid")
     smooth = top / np.convolve(np.pad(weight, 3, mode="edge"), kernel, mode="valid")
     showing = np.flatnonzero(weight > 0.1 * float(np.median(weight[weight >= np.median(weight)])))
-    foremost = showing[np.argsort(smooth[showing])[: max(len(showing) // 3, 3)]]
+    foremost = showing[np.argsort(smooth[showing])[: max(len(showing) // 3, 5)]]
     lead = float(np.average(smooth[foremost], weights=weight[foremost]))
-    if len(foremost) >= 6:
+    if len(foremost) >= 5:
         middle = float(foremost.mean())
         curve = np.polyfit(foremost - middle, smooth[foremost], 2, w=np.sqrt(weight[foremost]))
         vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
         if foremost.min() <= vertex + middle <= foremost.max():
-            lead = float(np.polyval(curve, vertex))
+            lead = float(np.polyval(curve, vertex) - curve[0] * (0.8**2 + blur**2))
     return smooth - lead, lead
 
 
