@@ -461,6 +461,23 @@ def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: 
     return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16))
 
 
+@pytest.mark.parametrize(("radius", "tip_depth"), [(24.0, 10.0), (6.0, 3.0)])
+def test_the_edge_is_that_of_the_foremost_point_of_a_thin_tube_too(radius, tip_depth):
+    error, _ = errors(*followed(seed=8101, rest_frames=20, radius=radius, tip_depth=tip_depth, tail_sd=0.0))
+    assert abs(error.mean()) < 0.06
+    assert error.std() < 0.1
+
+
+def test_a_tube_that_draws_back_is_not_followed_where_it_was_before():
+    out, slow = (plain_scene(Plan(**SHORT, seed=8102, rest_frames=20, speed=speed)) for speed in (20.0, 2.0))
+    back = np.flatnonzero(slow.edge_px > 300)[::-1]
+    back = np.append(back, np.repeat(back[-1:], 60))
+    seen, edge_px = np.concatenate([out.frames, slow.frames[back]]), np.append(out.edge_px, slow.edge_px[back])
+    tracking = pictures.tracked(seen, out.plan.exposure, axis_through([(0.0, 80.0), (519.0, 80.0)]))
+    wrong = np.abs(tracking.track.edge_px - SHORT["from_px"][0] - edge_px) > 5
+    assert not (wrong & tracking.track.usable).any()
+
+
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
 def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast):
     strip, edge, pictures = stepping(rim=True, contrast=contrast)

@@ -721,6 +721,25 @@ def _hidden_px(contrast: NDArray[np.float32], edge: Floats, tube: Outline) -> Fl
     return np.maximum(after - before - 2 * near - 2, 0) / math.sqrt(12)
 
 
+def _elsewhere_px(strip: Strip, state: EdgeState, fit: Floats, edge: Floats, passed: tuple[int, int]) -> Floats:
+    """How far away the pixels of a frame put its edge, where a whole column of them says so; 0 in other frames. A path
+    that never retreats is wrong there: it runs along no tube, or the tube draws back. Within reach of the tip, which
+    looks unlike film and background, the edge must fit no worse there too. Not behind the first column passed, whose
+    background nobody saw. Shapes: fit (n_frames, 5); edge (n_frames,) → (n_frames,).
+    """
+    from scipy.ndimage import minimum_filter1d
+
+    cost, frames = _path_by_appearance(strip, state.appearance, passed)[1], np.arange(len(edge))
+    best, at = passed[0] + cost[:, passed[0] :].argmin(axis=1), np.clip(np.rint(edge).astype(int), 0, cost.shape[1] - 1)
+    # 9: columns about the edge, of which the best is taken, px (chosen)
+    gain = minimum_filter1d(cost, 9, axis=1)[frames, at] - cost[frames, best]
+    away = np.flatnonzero(gain > kernels.CLIP**2 * len(state.lag))
+    found, distance = search_edges(strip, state, away, best[away] - 0.5), np.zeros(len(edge))
+    beyond_tip = np.abs(best - edge)[away] > SHADING_REACH_PX + state.lag.max()
+    distance[away] = np.where(beyond_tip | (found[:, 2] <= fit[away, 2]), np.abs(best - edge)[away], 0.0)
+    return distance
+
+
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
     """Add to a converged fit the errors of its bands and of hidden tips, and refer the edge to mid-exposure."""
     from scipy.ndimage import median_filter
@@ -743,7 +762,9 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, t
     shared = 1.0 / np.maximum(contrast[column], 1.0)
     in_mouth, ratio = find_mouth(strip, state, edge_now), fit[:, 2] / usual
     guess = np.where(in_mouth, np.inf, hidden_errors(fit, ratio, edge_now))
-    slow = np.sqrt(unseen**2 + shared**2 + guess**2 + _hidden_px(np.abs(difference).mean(axis=0), edge_now, tube) ** 2)
+    hidden = _hidden_px(np.abs(difference).mean(axis=0), edge_now, tube)
+    elsewhere = _elsewhere_px(strip, state, fit, edge_now, tube.passed)
+    slow = np.sqrt(unseen**2 + shared**2 + guess**2 + hidden**2 + elsewhere**2)
     # 1.3: misfit over the usual one above which a frame near the start is doubtful; 1.5: amplitude (relative contrast)
     # above which any is, since something adds to the edge (chosen)
     odd = (_near_start(edge_now) & (ratio > 1.3)) | (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1)
