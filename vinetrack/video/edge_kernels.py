@@ -80,7 +80,6 @@ def subpixel_index(place: float) -> tuple[int, int, float]:
 
 BANDS = 6  # Bands of rows from whose scatter the error of an edge is taken; 4 to 20 do as well (measured)
 CLIP = 2.5  # Standard deviations at which the difference from film or background is clipped (chosen)
-FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
 FILM_BIAS = 0.1  # Evidence in favour of film in every pixel (chosen)
 
 
@@ -89,13 +88,13 @@ def film_evidence(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, appearance: np.ndarray, width: float
 ) -> np.ndarray:
     """Score each column of each frame: negative where it looks like film, positive where like background. The score is
-    the sum over rows of min(a², FILM_CLIP_RATIO CLIP²) − min(b², CLIP²), with a and b the distances from film and
+    the sum over rows of min(a², 1.7 CLIP²) − min(b², CLIP²) − FILM_BIAS, with a and b the distances from film and
     background in standard deviations (`width` and the pixel's own variance). Shape (n_frames, n_along).
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
     unit, film_bias, extra_variance = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
-    background_clip, film_clip = np.float32(CLIP**2), np.float32(FILM_CLIP_RATIO * CLIP**2)
+    background_clip, film_clip = np.float32(CLIP**2), np.float32(1.7 * CLIP**2)  # 1.7: film may look odder (chosen)
     weight = unit / (appearance[2:] + extra_variance)
     for t in range(n):
         gain, level = np.float32(scale[t]), np.float32(offset[t])
