@@ -226,7 +226,7 @@ class BoardSeen:
 def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     """Find the printed board in a picture. Shapes: picture (height, width)."""
     grey = eight_bits(picture)
-    seen = [(*_detect_markers(grey, _dictionary(_largest(family))), family) for family in OTHER_DICTIONARIES]
+    seen = [(*_detect_markers(grey, _dictionary(_smallest(family, math.inf))), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
     best_share, best_board, n_markers = 0.0, None, int(ids.max(initial=0)) + 1
     # Squares across and down, at most 40, of the boards with this many markers, of which two may be hidden (chosen)
@@ -237,7 +237,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
             continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
         board = Charuco(kind="charuco", image="seen", squares=layout, square_mm=1.0, marker_mm=0.7, dictionary=family)
-        share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
+        share, marker, _ = _best_layout(corners, ids, board, _dictionary(_smallest(family, math.inf)))
         if share > best_share:
             best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
     if best_share >= LEAST_IN_PLACE:
@@ -246,12 +246,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     return None if squares is None else BoardSeen("checkerboard", squares)
 
 
-def _largest(family: str) -> str:
-    """The largest dictionary of a family."""
-    return f"{family}_{DICTIONARY_SIZES[-1]}" if family[-2] == "X" else family
-
-
-def _smallest(family: str, n_markers: int) -> str:
+def _smallest(family: str, n_markers: float) -> str:
     """The smallest dictionary of a family that has enough words for a board."""
     if family[-2] != "X":
         return family
