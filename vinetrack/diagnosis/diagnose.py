@@ -154,6 +154,7 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
         not_tried=tuple(not_tried),
         fits=(fit, *(step.tests.fit for step in steps[1:])),
         power=power_of(steps[-1].tests, not_testable),
+        refused=str(remark("take_effects_out")) if steps[-1].is_open else "",
     )
 
 

@@ -479,6 +479,11 @@ class SelectionStep:
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
 
     @property
+    def is_open(self) -> bool:
+        """Whether nothing can be said: no test rejects the model, but its fit does not converge."""
+        return self.verdict == UNEXPLAINED and not self.tests.fit.converged and not self.tests.rejects_model
+
+    @property
     def slips(self) -> dict[str, str]:
         """The slips in the sheet that would produce the fitted sizes of the answer set, each with its effect."""
         found: dict[str, str] = {}
@@ -497,8 +502,9 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     trial_differences = differences(fit)
     differing = significant(trial_differences, FALSE_ALARM_LEVEL_FIRST_ROUND)
     nothing_rejects = not tests.rejects_model and not any(difference.stated for difference in differing)
+    passed = ADEQUATE if fit.converged else UNEXPLAINED
     if nothing_rejects and not tests.needs_search:
-        return [SelectionStep(ADEQUATE, tests, unstated_differences=tuple(between_fits(fit, differing, 0.0, report)))]
+        return [SelectionStep(passed, tests, unstated_differences=tuple(between_fits(fit, differing, 0.0, report)))]
 
     # The most promising single effects, a tail that may go slack, and differences between trials.
     search = Search(tests, report)
@@ -510,7 +516,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
     alone += between
 
-    def nothing_found(verdict: str = ADEQUATE) -> list[SelectionStep]:
+    def nothing_found(verdict: str = passed) -> list[SelectionStep]:
         differ = unstated if verdict == ADEQUATE else ()
         return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), unstated_differences=differ)]
 
@@ -539,7 +545,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     if not any(map(is_significant, answer_set(credible)[0] if credible else ())):
         # A score that no refit confirms counts only if another test rejects the model too.
         hypotheses = search.of_size(1)
-        return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else ADEQUATE)
+        return nothing_found(UNEXPLAINED if tests.omnibus_rejects or exceeds_slow_errors(fit) else passed)
     return _effect_set_rounds(search, alone)
 
 

@@ -126,6 +126,8 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
         verdict, names = "sheet_contradicted", list(diagnosis.contradicted_columns)
     elif answers == (DROPPED_FRAMES,):
         verdict = DROPPED_FRAMES
+    elif verdict and diagnosis.refused:
+        verdict = "does_not_converge"
     elif verdict == ARTEFACT and trials_differ(answers):
         verdict, names = "only_trials_differ", list(map(difference_text, answers))
     added = [name for name in diagnosis.initial_model if name not in BASE_EFFECTS]
@@ -297,6 +299,8 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.contradicted_columns:
         told = " ".join(f"{str(note).rstrip('.')}." for note in diagnosis.notes[: len(diagnosis.contradicted_columns)])
         return "correct the sheet and run again", f"{told} With the sheet as it is, the verdict is {verdict}."
+    if diagnosis.refused:
+        return diagnosis.refused, ""
     if diagnosis.odd_trials:
         return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
     if TAIL_SLACK in diagnosis.effects:
@@ -319,7 +323,7 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         return f"keep it with {saved}, and measure its size by other means", _remedies(diagnosis.effects)
     if verdict == AMBIGUOUS:
         return "measure what tells them apart", _remedies(diagnosis.answer_set)
-    return ("use the model where you filmed" if verdict == ADEQUATE else str(diagnosis.refused)), ""
+    return ("use the model where you filmed" if verdict == ADEQUATE else ""), ""
 
 
 def _remedies(names: Sequence[str]) -> str:
@@ -441,6 +445,8 @@ def explain(step: SelectionStep) -> str:
 
 
 def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
+    if step.is_open:
+        return sentence("model_is_open", {"model": model, "trials": trials})
     text = sentence("nothing_explains", {"model": model, "trials": trials})
     for name, why in step.rejected:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
