@@ -63,6 +63,7 @@ def test_cells_and_lines_stay_where_they_are(tmp_path):
     assert (table.rows, table.extra) == (({"a": "1", "b": ""}, {"a": "1", "b": "2"}), ((), ("3", "")))
     # A decimal comma may have split a number, and pushed out a blank; a separator at every end is a habit.
     assert [parse_table(f"p,m,angle\n2.5,0,{end}\n3,5,0,\n").extra for end in ("", ",")] == [((), ("",)), ((), ())]
+    assert parse_table("p,m\n3,5,\n4,5,\n2\n").extra == (("",), ("",), ())
     assert [parse_table(f"a,,b\n1,{cell},2\n").nameless for cell in ("remark", "")] == [True, False]
     np.testing.assert_array_equal(parse_table("x,y\n1,1\n,1\n").numbers("x", blank_is_nan=True), [1, np.nan])
 

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from statistics import mode
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -83,7 +82,7 @@ _AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # Such 
 class Table:
     """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank, or if the line is
     short); `lines[i]` is its line in the file, from 1; `extra[i]`: cells beyond the last column, blank ones only where
-    most rows have none; `nameless`: a column without a name has content; `units`: of columns in another unit.
+    a row has none; `nameless`: a column without a name has content; `units`: of columns in another unit.
     """
 
     columns: tuple[str, ...]
@@ -177,13 +176,13 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
     named, width = tuple(filter(None, columns)), len(columns)
     if repeated := sorted({column for column in named if named.count(column) > 1}):
         raise InputError(f"names the column {repeated[0]!r} twice", "keep one of them")
-    usual = mode([width, *(len(cells) for _, cells in body)])
+    every = max(width, min((len(cells) for _, cells in body), default=width))  # a separator at the end of each line
     pairs = [list(zip_longest(columns, cells[:width], fillvalue="")) for _, cells in body]
     return Table(
         columns=named,
         rows=tuple({name: cell for name, cell in row if name} for row in pairs),
         lines=tuple(line + skip_lines for line, _ in body),
-        extra=tuple(tuple(cells[width:]) if len(cells) > usual or any(cells[width:]) else () for _, cells in body),
+        extra=tuple(tuple(cells[width:]) if len(cells) > every or any(cells[width:]) else () for _, cells in body),
         delimiter=delimiter,
         decimal=_find_decimal([cell for _, cells in body for cell in cells], delimiter),
         nameless=any(cell and not name for row in pairs for name, cell in row),

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.missing_force import LearnedForce
     from vinetrack.diagnosis.propose import Proposal
     from vinetrack.diagnosis.result import EffectPower, FurtherTrials, Power
-    from vinetrack.inference.fit_result import Fit
+    from vinetrack.inference.fit_result import Fit, Number
 
 
 # ------------------------------------------------------------------------------
@@ -285,11 +285,18 @@ def added_in_words(before: Fit, after: Fit, ladder: pd.DataFrame) -> list[str]:
         "",
         "parameters",
     ]
-    was, now = ({(one.title, one.shown[0]): value_text(one) for one in fit.numbers} for fit in (before, after))
-    body = [(title, was.get((title, unit), "–"), now.get((title, unit), "–"), unit) for title, unit in was | now]
+    known = {one.name: one for fit in (before, after) for one in fit.numbers}
+    was, now = ({one.name: value_text(one) for one in fit.numbers} for fit in (before, after))
+    body = [(_title(one, known), was.get(name, "–"), now.get(name, "–"), one.shown[0]) for name, one in known.items()]
     lines += table(body, ("", "before", "after", "unit"), align="<>><")
     against = not_better(ladder) if gain > 9.0 else []
     return lines + [f"! {message}" for message in (*against, *after.messages)]
+
+
+def _title(fitted: Number, beside: Mapping[str, Number]) -> str:
+    """Symbol and vine of a number; with its effect where another effect has that symbol too."""
+    is_shared = any(one.symbol == fitted.symbol and one.key != fitted.key for one in beside.values())
+    return f"{fitted.title} of {fitted.key.split('.')[0]}" if is_shared else fitted.title
 
 
 # ------------------------------------------------------------------------------
