@@ -169,6 +169,8 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else " `vinetrack effects` lists them all."
+    if name == "tail_slack":
+        hint = " It is a rule of the model: `tail_slack: free` in experiment.yaml."
     raise EffectError(f"There is no effect named {name!r}.{hint}")
 
 

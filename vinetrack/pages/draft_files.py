@@ -279,7 +279,7 @@ def read_block(text: str) -> list[list[str]]:
     lines, decimal_comma = [line for line in text.splitlines() if line.strip()], re.compile(r"[+-]?\d+,\d+")
     if any("\t" in line for line in lines):
         delimiter = "\t"
-    elif any(";" in line for line in lines):
+    elif 2 * sum(";" in line for line in lines) > len(lines):  # one may stand in a remark
         delimiter = ";"
     elif any("," in decimal_comma.sub("", line) or line.count(",") > 1 for line in lines) or (
         # One comma in each line separates cells where blanks do not, and not all lines are numbers.
@@ -365,7 +365,7 @@ def place_block(
             notes.append(f"No recording for “{' '.join(cells)}”: left out.")
             continue
         for name, cell in zip(header, cells, strict=False):
-            if cell and name and name != "trial":
+            if cell.strip("-–—") and name and name != "trial":  # a dash: none
                 try:
                     given.setdefault(name, []).append((row, cell, value_and_unit(cell, name)[1]))
                 except InputError as error:

@@ -267,7 +267,8 @@ def find_experiment(folder: Path) -> Path:
     from vinetrack.experiment.folder import closest_entry
 
     if experiment := claim(folder / CLAIM_FILE).get("experiment", ""):
-        raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=f"give {experiment}")])
+        remedy = f"give {experiment}; vinetrack run {experiment} finishes results that were stopped"
+        raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=remedy)])
     if folder.exists():
         return folder
     close = closest_entry(folder)

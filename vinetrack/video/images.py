@@ -38,15 +38,15 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
     true_fps, stated = recording.capture_fps, trial.capture_fps
     if true_fps is not None:
         if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
-            message = f"capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording"
-            raise RecordingError(message, "correct the sheet", trial.name)
+            message = f"capture_fps is stated as {stated:g} but {true_fps:g} in the recording"
+            raise RecordingError(message, "correct it", trial.name)
         return true_fps
     if not np.isfinite(stated):
         raise RecordingError("capture_fps is missing", "the file knows its playback rate only", trial.name)
     playback = recording.playback_fps
     if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
         raise RecordingError(
-            f"capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g})",
+            f"capture_fps is stated as {stated:g}, the rate at which the file plays ({playback:.4g})",
             "write the rate of capture, or capture_fps_is_playback: yes where it plays as fast as it was captured",
             trial.name,
         )
@@ -60,8 +60,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
         return stated_s
     # 0.02: relative difference within which exposures of sheet and recording are the same (chosen)
     if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > 0.02:
-        message = f"exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording"
-        raise RecordingError(message, "correct the sheet", trial.name)
+        message = f"exposure_us is stated as {1e6 * stated_s:.4g} but {1e6 * true_s:.4g} in the recording"
+        raise RecordingError(message, "correct it", trial.name)
     return true_s
 
 
