@@ -294,6 +294,8 @@ def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_s
     assert blind["inlet_loss"].facts["column"] == "inlet_mm"
     assert blind["payload_drag"].facts["column"] == "payload_g"
     assert "static_yield" in blind
+    unfinished = diagnosed(replace(nothing_missing.fit, converged=False))
+    assert (unfinished.verdict, bool(unfinished.refused)) == ("unexplained", True)
 
 
 def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):

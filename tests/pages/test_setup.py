@@ -156,6 +156,9 @@ def test_what_matches_nothing_is_named_and_changes_nothing():
     assert changed("1\t2\n3\t4", 0, "trial") == {}
     assert [notes(text), notes("24\n30\n36\n42", "pressure_kPa"), notes("1\t2\n3\t4")] == [3, 2, 1]
     assert notes("24\t0\t5", "pressure_kPa") == 1
+    # A dash is nothing; a line with another separator than most alone is lost.
+    assert changed("clip,kPa,load\nlate,36,-\nd15_24kPa_1;24;5\nd15_30kPa_1,30,2") == {
+        (2, "pressure_kPa"): "36", (1, "pressure_kPa"): "30", (1, "payload_g"): "2"}  # fmt: skip
     # A name of two recordings is of neither.
     rows = [{"trial": "a", "video": "x/1.mp4"}, {"trial": "b", "video": "y/1.mp4"}]
     block = "1.mp4\t24\nx/1.mp4\t30"
