@@ -25,7 +25,7 @@ PARAMETERS = (
         bounds=(-0.95, 19.0),
         shared="day",
         plausible=(-0.1, 0.1),
-        tried=(9.0, -0.9),
+        tried=(3.0, -0.75),
         meaning="relative error of time",
         slips=(
             (1.0, "half the frame rate was stated"),

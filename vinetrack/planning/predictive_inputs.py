@@ -612,6 +612,7 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
                 f"looks like {what}: the measured speeds imply {number(as_stated, 2)} times the damping of tubes of "
                 f"this size, and {number(ratio, 2)} times {how}"
             )
+            remedy += ", if capture_fps and the scale are right"
             return [Problem(message=message, column=f"pressure_{stated}", remedy=remedy, **place)]
     shares = []  # Kinetic energy halfway at the mean speed, over the work of gas and weight in the whole growth
     for trial, speed in pairs:
