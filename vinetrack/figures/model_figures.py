@@ -142,7 +142,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
         ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 2.2 * longest))
         ax.set_title(title, fontsize=10)
         ax.set_xticks([tick for tick in ax.get_xticks() if tick <= 1.08 * longest])
-    axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
+    axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained")
     present = {role for _, table in drawn for role in table["role"]}
     handles = [st.patch_key(words, colour, alpha) for role, (words, colour, alpha) in roles.items() if role in present]
     if any((table["status"] == "screened").any() for _, table in drawn):
