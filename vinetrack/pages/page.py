@@ -490,6 +490,8 @@ class Page:
     def _update_status(self) -> None:
         """Update the status line."""
         background, text = self.background, ""
+        told = () if self.last is None else self.last.fit.messages
+        unfinished = next((str(message) for message in told if message.code == "not_converged"), "")
         if self._job is not None:
             # A fit starts from that of the model in use.
             waits = background.running
@@ -497,7 +499,7 @@ class Page:
             done, since_s = 0 if step is None else step.iteration, time.monotonic() - self._begun_s
             # 5: steps after which the bar is half full; how many there will be is not known (chosen)
             text = plots.progress_bar(done / (done + 5), f"{task} · step {done} · {since_s:.1f} s")
-        elif failure := self._message or background.failure:
+        elif failure := self._message or background.failure or unfinished:
             text = f'<span class="bad">{escape(failure)}</span>'
         elif background.running:
             fitting = "fitting the model in use, in the background"

@@ -484,7 +484,8 @@ def track_pixels(
         # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
         if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
             what = "something moves, but its edge is too vague to be followed"
-            raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
+            remedy = "film it nearer, with more light or contrast, or at more frames a second, or state the growth axis"
+            raise RecordingError(what, remedy, name)
         raise RecordingError("nothing moves along the axis", NO_GROWTH, name)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
     notes, ending = _notes(frames, number, trial, followed, quality, axis_given)
