@@ -273,8 +273,8 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
 
 def _smooth_lag(lag: Floats, weight: Floats, blur: float) -> tuple[Floats, float]:
     """Smooth the lag slightly along the rows, by weight, and subtract that of the foremost point; both are returned.
-    The foremost point is the vertex of a parabola through the foremost third of the rows that show an edge: the
-    smallest lag would follow their noise.
+    The foremost point is the vertex of a parabola through the foremost third of the rows that show an edge, or five:
+    the smallest lag would follow their noise. Smoothing and blur, of variance s², set a parabola c u² back by c s².
     """
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / 0.8) ** 2)
     weight = weight + 1e-6 * float(weight.max() + 1e-12)
