@@ -148,7 +148,7 @@ def test_draws_have_the_covariance_of_the_fit_and_its_spreads_with_the_doubt_of_
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess():
     inputs = vt.predictive_inputs(trial(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
-    assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
+    assert (inputs.medians[B], inputs.medians[YIELD]) == pytest.approx((3.0, 3200.0))  # half the wall, half of B
     assert [(note.code, note.facts["vine"]) for note in inputs.notes] == [("B_carried_over", "24mm-200um-280mm")]
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
 

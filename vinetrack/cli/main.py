@@ -309,7 +309,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
     from vinetrack.kinematics.summary import look_at_motions
-    from vinetrack.pipeline.analysis import diagnosed, write_diagnosis
+    from vinetrack.pipeline.analysis import diagnosed, diagnosis_content, write_diagnosis
 
     results = layout.Results(target)
     if results.provenance.exists():
@@ -319,7 +319,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
         if json is None:
             settings = run_settings(layout.read_json(results.provenance)["settings"])
             write_diagnosis(results, diagnosis, partial(look_at_motions, pairs, settings), settings)
-        return [str(diagnosis).replace("RESULTS", str(target))], diagnosis.to_json()
+        return [str(diagnosis).replace("RESULTS", str(target))], diagnosis_content(diagnosis)
     read = read_experiment(workflow.find_experiment(target))
     if read.trials and all(trial.track is None for trial in read.trials):
         raise UserError(
@@ -327,7 +327,7 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
             f"diagnoses them; after that, vinetrack diagnose {Path('results') / read.name}"
         )
     diagnosis = diagnose(read, report=report)
-    return [str(diagnosis)], diagnosis.to_json()
+    return [str(diagnosis)], diagnosis_content(diagnosis)
 
 
 @command()

@@ -154,7 +154,10 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     only: str = "",
 ) -> Power:
-    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
+    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect: in the first round
+    of a diagnosis of its model, also where that is one with effects that a diagnosis added.
+    """
+    tests = replace(tests, level=FALSE_ALARM_LEVEL_FIRST_ROUND)
     # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
     start = noiseless_start(tests.fit) if tests.fit.solution.noise_held else None
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
@@ -361,13 +364,11 @@ def _false_alarm_rate(fit: Fit) -> float:
 # and between-trial scatter expected of them.
 
 
-def fitted_tests(
-    fitted: Fit, candidates: Sequence[str] | None = None, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND
-) -> tuple[MisfitTests, dict[str, Remark]]:
+def fitted_tests(fitted: Fit, candidates: Sequence[str] | None = None) -> tuple[MisfitTests, dict[str, Remark]]:
     """Misfit tests of a fit with all candidates, and the reasons by name of those that cannot act with this sheet."""
     tried = candidates_of(fitted.model, candidates, fitted.model.user_effects)
     effects, not_testable = testable(tried, fitted.predictor.data)
-    return misfit_tests(fitted, effects, level), not_testable
+    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), not_testable
 
 
 def planned_tests(

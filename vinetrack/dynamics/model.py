@@ -263,7 +263,8 @@ def check_needs(model: Model, *trials: Trial) -> None:
         for effect, column in needs:
             value = _of_trial(column, trial)
             if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
-                raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
+                remedy = f"fill in this column, or state --{column.replace('_', '-')} of a vine to predict"
+                raise EffectError(f"Trial {trial.name}: {effect.name} needs `{column}`, which is blank: {remedy}.")
 
 
 # ------------------------------------------------------------------------------

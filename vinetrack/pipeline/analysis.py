@@ -438,8 +438,12 @@ def write_diagnosis(
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]) if diagnosis.fits else ():
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, ladder)
-    summary = [vars(row) for row in verdict_table(diagnosis)]
-    write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
+    write_json(results.diagnosis, diagnosis_content(diagnosis))
+
+
+def diagnosis_content(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Content of `diagnosis.json`, with the table of the verdict as it is told."""
+    return {**diagnosis.to_json(), "summary": [vars(row) for row in verdict_table(diagnosis)]}
 
 
 def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:

@@ -22,7 +22,7 @@ from vinetrack.core.units import PREDICTION_UNITS, display_unit, number, pressur
 from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS, MisfitTests
+from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import ADEQUATE, Power, PowerInput, SimulatedRates
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS, catalogue
@@ -181,7 +181,7 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
         if abs(one.change) >= 0.005
     ]
     if changes:
-        yield from ("", *table(changes, ("not in the model", "at its usual size", "final speed", ""), align="<<<>"))
+        yield from ("", *table(changes, ("not in the model", "at its usual size", "final speed at the medians", ""), align="<<<>"))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 
@@ -409,14 +409,12 @@ def _campaign_of_target(request: PowerRequest) -> Campaign:
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
     model = make_model(names, experiment.user_effects)
-    # A diagnosis tests a model to which it has added effects at another level.
-    level = FALSE_ALARM_LEVEL_LATER_ROUNDS if added else FALSE_ALARM_LEVEL_FIRST_ROUND
-    return _measured_campaign(request, model, pairs, level, settings.candidates, settings.limits)
+    return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
 
 
 def _measured_campaign(
-    request: PowerRequest, model: Model, pairs: Pairs, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND,
-    candidates: Sequence[str] | None = None, limits: Limits | None = None,
+    request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None = None,
+    limits: Limits | None = None,
 ) -> Campaign:  # fmt: skip
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
@@ -430,7 +428,7 @@ def _measured_campaign(
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host)
     else:
         inputs = []
-    return *linear_power.fitted_tests(fitted, candidates, level), inputs, limits or Limits()
+    return *linear_power.fitted_tests(fitted, candidates), inputs, limits or Limits()
 
 
 def _planned_campaign(request: PowerRequest, planned: experiments.Experiment) -> Campaign:

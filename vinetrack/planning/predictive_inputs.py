@@ -429,10 +429,13 @@ class _Assembly:
             self.vary(EXPONENT, error, "error of n", "n printed", remark("n_printed", error=error))
 
     def yield_pressure(self) -> None:
-        """P_y: as fitted for this vine, unless the sheet contradicts it; as stated; as printed, for one vine or all."""
+        """P_y: as fitted for this vine, unless the sheet contradicts it; as stated; as fitted for another vine; as
+        printed, for one vine or all.
+        """
         trial, fit = self.trial, self.fit
         stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
-        place = fit.place(YIELD_PRESSURE, self.vine, stated) if fit and self.is_same else None
+        nearest = fit.place(YIELD_PRESSURE, self.vine, stated) if fit else None
+        place = nearest if self.is_same else None
         if fit is not None and place is not None and math.isfinite(stated):
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
@@ -444,15 +447,18 @@ class _Assembly:
             self.set(YIELD, stated, "given")
             why = remark("P_y_stated", sigma=(sigma, trial.pressure_unit))
             self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
-        elif self.printed == TABLE_I[4]:  # the vine whose yield pressure is printed
+        elif nearest is None and self.printed == TABLE_I[4]:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
             self.set(YIELD, printed_Pa, "printed", source=SOURCE)
             why = remark("P_y_printed", sigma=(rounding_Pa, trial.pressure_unit))
             self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
-            self.set(YIELD, printed_Pa, "P_y_guessed")
+            if nearest is None:
+                self.set(YIELD, printed_Pa, "P_y_guessed")
+            else:
+                self.set_fitted(YIELD, nearest, origin="P_y_carried_over", vine=self.vine)
             sigma = math.log(3.0) / 1.6448536269514722  # nine of ten vines within a factor of 3
-            why = remark("P_y_guess", printed=(printed_Pa, trial.pressure_unit))
+            why = remark("P_y_guess", known=(self.values[YIELD], trial.pressure_unit))
             self.vary(YIELD, sigma, "guess of P_y", "P_y guess", why, log=True)
 
     def other_parameters(self, model: Model) -> None:
