@@ -61,7 +61,7 @@ def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_ar
 
 
 def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_its_cells(tmp_path):
-    for name in ("a.mp4", "d12_30kPa_1.mp4"):
+    for name in ("a.mp4", "d12_30kPa_1.mp4", "ruler.jpg", "notes.txt"):
         (tmp_path / name).write_bytes(b"x")
     sheet, settings = tmp_path / "trials.csv", tmp_path / "experiment.yaml"
     lines: list[str] = []
@@ -69,6 +69,7 @@ def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_
     assert [(row["diameter_mm"], row["pressure_kPa"]) for row in read_table(sheet).rows] == [("", ""), ("12", "30")]
     assert settings.read_text() == draft.first_settings()
     assert any("capture_fps" in line and "calibration" in line for line in lines if line.startswith("To fill in"))
+    assert any("ruler.jpg" in line and "notes.txt" in line for line in lines)
 
     sheet.write_text(SHEET)
     settings.write_text(SETTINGS)
@@ -156,6 +157,9 @@ def test_what_matches_nothing_is_named_and_changes_nothing():
     assert changed("1\t2\n3\t4", 0, "trial") == {}
     assert [notes(text), notes("24\n30\n36\n42", "pressure_kPa"), notes("1\t2\n3\t4")] == [3, 2, 1]
     assert notes("24\t0\t5", "pressure_kPa") == 1
+    # Below a name columns follow each other; of a file of notes nobody said which is the first.
+    assert changed("late\t1069\t15\t36")[2, "pressure_kPa"] == "36"
+    assert (changed("late\t1069\t15\t36", at_column=""), notes("late\t36", "")) == ({}, 1)
     # A dash is nothing; a line with another separator than most alone is lost.
     assert changed("clip,kPa,load\nlate,36,-\nd15_24kPa_1;24;5\nd15_30kPa_1,30,2") == {
         (2, "pressure_kPa"): "36", (1, "pressure_kPa"): "30", (1, "payload_g"): "2"}  # fmt: skip

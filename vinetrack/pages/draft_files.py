@@ -306,7 +306,7 @@ def place_block(
 ) -> tuple[list[tuple[int | str, str, str]], list[str]]:
     """Say which cells of a table with these columns (as shown, without the trial) and rows a pasted block changes, as
     (row of the sheet or `SHARED_ROW`, column, text), and what was left out, in sentences. Without a header its columns
-    follow the one pasted into, and without names its rows the row pasted into.
+    follow the one pasted into (none if that is blank), and without names its rows the row pasted into.
     """
     placed: list[tuple[int | str, str, str]] = []
     given: dict[str, list[tuple[int | str, str, str]]] = {}
@@ -346,8 +346,8 @@ def place_block(
         wide = max(map(len, block), default=0)
         found = [sum(_plain(cells[i]) in row_named for cells in block if i < len(cells)) for i in range(wide)]
         name_place = found.index(max(found)) if any(found) else None
-        if at_column not in columns and name_place is None:
-            notes.append("No cell of this block is the name of a recording or of a column: nothing was pasted.")
+        if not at_column or (at_column not in columns and name_place is None):
+            notes.append("No line of headings, such as “clip, pressure_psi, payload_g”: write one above the rows.")
             return placed, notes
         start = columns.index(at_column) if at_column in columns else 0
         places = [i for i in range(wide) if i != name_place]

@@ -512,4 +512,7 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     ]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
+    notes = [name for name in files.list_tables(folder, (".txt", ".md")) if name not in files.list_tracks(folder)]
+    if unread := [*notes, *files.list_pictures(folder)]:
+        say(f"Not read here: {', '.join(unread)}. The page reads notes and rulers: vinetrack setup {folder}")
     say(f"Then: vinetrack check {folder}")

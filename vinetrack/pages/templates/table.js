@@ -9,8 +9,8 @@ export function drawTable() {
   table.onkeydown = move;
   $("notes").replaceChildren(el("option", {value: ""}, "…"), ...state.notes.map((name) => el("option", {value: name}, name)));
   $("notes").parentElement.hidden = !state.notes.length;
-  $("notes").onchange = ({target}) => { propose({file: target.value}, "trial", 0); target.value = ""; }; // to be read again
-  $("other-notes").onchange = async ({target}) => { await propose({text: await target.files[0].text()}, "trial", 0); target.value = ""; };
+  $("notes").onchange = ({target}) => { propose({file: target.value}, "", 0); target.value = ""; }; // to be read again
+  $("other-notes").onchange = async ({target}) => { await propose({text: await target.files[0].text()}, "", 0); target.value = ""; };
   $("traces").replaceChildren(...state.traces.map((name) => el("option", {value: name})));
   drawAdder(columns);
   markProblems();
