@@ -237,7 +237,7 @@ def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
             origin.begin_run(paths[1], paths[0])
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
-            workflow.run_chain(*paths, 1, print)
+            workflow.check_before_run(*paths, print)
         other.kill()
     assert not (paths[1] / "logs").exists()
     origin.begin_run(paths[1], paths[0]).release()

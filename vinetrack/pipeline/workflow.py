@@ -551,6 +551,8 @@ def check_before_run(experiment: Path, results: Path, say: Say) -> None:
     """Print the problems of an experiment before its run; a check of the same files that found no error is kept."""
     from vinetrack.experiment.folder import read_experiment
 
+    if results.is_dir():
+        locked(results).release()  # refused, if another running process writes there
     if find_ground_truth(experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
     kept, files = Kept(results), []
@@ -575,8 +577,6 @@ def check_before_run(experiment: Path, results: Path, say: Say) -> None:
 
 def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bool = False) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, a line per stage elsewhere, or all it says."""
-    if results.is_dir():
-        locked(results).release()  # refused, if another running process writes there
     log = results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.
