@@ -159,9 +159,12 @@ def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_correct
     np.testing.assert_array_equal(correct_frames(track).time_s, track.time_s)
 
 
-@pytest.mark.parametrize("flight", [2.0, 1.0])
-def test_a_track_does_not_follow_the_payload(flight):
-    scene = plain_scene(Plan(**{**SHORT, "seed": 302, "end_px": 330.0}))
+@pytest.mark.parametrize(
+    ("speed", "flight", "in_flight"), [(20.0, 2.0, 99), (20.0, 1.0, 99), (8.0, 1.0, 6), (4.0, 1.0, 12), (4.0, 2.0, 5)]
+)
+def test_a_track_does_not_follow_the_payload(speed, flight, in_flight):
+    """Whether it leaves the picture or the recording ends while it flies."""
+    scene = plain_scene(Plan(**{**SHORT, "seed": 302, "end_px": 330.0, "speed": speed}))
     luma = scene.frames.copy()
     last = int(np.flatnonzero(scene.moving)[-1])
     speed = scene.edge_px[last - 1] - scene.edge_px[last - 2]
@@ -169,8 +172,9 @@ def test_a_track_does_not_follow_the_payload(flight):
         x = 350 + (28 if flight < 2 else 0) + flight * speed * (t - last + 1)
         disc = cv2.circle(np.zeros_like(luma[t], np.float32), (round(x), 80), 14, 1.0, -1, cv2.LINE_AA)
         luma[t] = np.rint(luma[t] * (1 - disc) + 12 * disc).astype(np.uint8)
+    luma = luma[: last + in_flight]
     tracking = pictures.tracked(luma, scene.plan.exposure)
-    error = tracking.track.edge_px + tracking.axis.from_px[0] - 20.0 - scene.edge_px
+    error = tracking.track.edge_px + tracking.axis.from_px[0] - 20.0 - scene.edge_px[: len(luma)]
     assert np.abs(error[tracking.track.usable]).max() < 2.0
     assert with_flag(tracking.track.flag, "after_end")[last + 2 :].all()
 

@@ -181,7 +181,8 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
         if abs(one.change) >= 0.005
     ]
     if changes:
-        yield from ("", *table(changes, ("not in the model", "at its usual size", "final speed at the medians", ""), align="<<<>"))
+        head = ("not in the model", "at its usual size", "final speed at the medians", "")
+        yield from ("", *table(changes, head, align="<<<>"))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 

@@ -9,6 +9,7 @@ optical blur, the exposure and the light and shade that the tip carries with it 
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -466,6 +467,11 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 # several frames are averaged at either end.
 
 
+# Power of a column's change over that of its noise from which it counts as changed; length of a run of columns, px, of
+# which six in ten must have changed for a front to have passed (chosen)
+LEAST_CHANGE, RUN_PX = 70.0, 9
+
+
 def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
     film and background for a straight tip and a typical blur; and the first column of those that changed in runs, and
@@ -473,26 +479,35 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
     last, first = (np.sort(strip.brightness(frames), axis=0)[END_FRAMES // 2] for frames in ends)
-    # Power of each column's change, of rows averaged in groups, over that of the noise
-    # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
-    group_size = int(np.clip(len(first) // 12, 1, 4))
-    grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
-    power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (strip.noise**2 / group_size)
+    changed, changed_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness([-1])[0]))
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
     votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, weight)
     path = dividing_path(votes)
-    # 70.0: power of a column's change over that of its noise from which it counts as changed (chosen)
-    # 9, 0.6: length of a run of columns, px, and part of it that must have changed for a front to have passed (chosen)
-    run = np.convolve(power > 70.0, np.ones(9) / 9, mode="same") > 0.6
-    if run.sum() < 9:
-        raise ValueError("nothing moves along the axis")
-    changed_columns = np.flatnonzero(run & (power > 70.0))
-    passed = max(int(changed_columns[0]), column_after_leap(path)), int(changed_columns[-1]) + 1
+    # Film stays. A payload that flies on, no longer than the tube is wide, leaves columns that changed and turned back.
+    for end, begin in itertools.pairwise([*changed_now.tolist(), len(first[0])]):
+        if begin - end > RUN_PX and changed_now[-1] - begin < len(first):
+            left, after = slice(end + RUN_PX // 2, begin - RUN_PX // 2), np.flatnonzero(path > end - RUN_PX)
+            change = np.mean((strip.brightness(after)[:, :, left] - first[:, left]) ** 2, axis=1)
+            if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE * strip.noise**2 and changed[0] < end:
+                changed = changed[changed <= end]
+    passed = max(int(changed[0]), column_after_leap(path)), int(changed[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
     return straight_tip(strip, _with_run_up(np.clip(path, *passed))), passed
+
+
+def _changed_columns(change: NDArray[np.float32], noise: float) -> Indices:
+    """Columns that changed, in runs, by the power of the change of rows averaged in groups over that of their noise."""
+    # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
+    group_size = int(np.clip(len(change) // 12, 1, 4))
+    grouped = change[: len(change) // group_size * group_size].reshape(-1, group_size, change.shape[1])
+    power = np.mean(grouped.mean(axis=1) ** 2, axis=0) / (noise**2 / group_size)
+    run = np.convolve(power > LEAST_CHANGE, np.ones(RUN_PX) / RUN_PX, mode="same") > 0.6
+    if run.sum() < RUN_PX:
+        raise ValueError("nothing moves along the axis")
+    return np.flatnonzero(run & (power > LEAST_CHANGE))
 
 
 def straight_tip(strip: Strip, path: Floats) -> EdgeState:
