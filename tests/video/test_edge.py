@@ -160,18 +160,25 @@ def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_correct
 
 
 @pytest.mark.parametrize(
-    ("speed", "flight", "in_flight"), [(20.0, 2.0, 99), (20.0, 1.0, 99), (8.0, 1.0, 6), (4.0, 1.0, 12), (4.0, 2.0, 5)]
+    ("speed", "flight", "ahead", "in_flight", "radius", "grey"),
+    [
+        (20, 2, 0, 99, 14, 12),
+        (20, 1, 28, 99, 14, 12),
+        (8, 1, 0, 6, 14, 12),
+        (4, 2, 0, 5, 14, 12),
+        (3.5, 1, 0, 9, 22, 170),
+    ],
 )
-def test_a_track_does_not_follow_the_payload(speed, flight, in_flight):
-    """Whether it leaves the picture or the recording ends while it flies."""
+def test_a_track_does_not_follow_the_payload(speed, flight, ahead, in_flight, radius, grey):
+    """Whether it leaves the picture or the recording ends while it flies, and where it looks like film."""
     scene = plain_scene(Plan(**{**SHORT, "seed": 302, "end_px": 330.0, "speed": speed}))
     luma = scene.frames.copy()
     last = int(np.flatnonzero(scene.moving)[-1])
     speed = scene.edge_px[last - 1] - scene.edge_px[last - 2]
     for t in range(last - 1, len(luma)):
-        x = 350 + (28 if flight < 2 else 0) + flight * speed * (t - last + 1)
-        disc = cv2.circle(np.zeros_like(luma[t], np.float32), (round(x), 80), 14, 1.0, -1, cv2.LINE_AA)
-        luma[t] = np.rint(luma[t] * (1 - disc) + 12 * disc).astype(np.uint8)
+        x = 350 + ahead + flight * speed * (t - last + 1)
+        disc = cv2.circle(np.zeros_like(luma[t], np.float32), (round(x), 80), radius, 1.0, -1, cv2.LINE_AA)
+        luma[t] = np.rint(luma[t] * (1 - disc) + grey * disc).astype(np.uint8)
     luma = luma[: last + in_flight]
     tracking = pictures.tracked(luma, scene.plan.exposure)
     error = tracking.track.edge_px + tracking.axis.from_px[0] - 20.0 - scene.edge_px[: len(luma)]

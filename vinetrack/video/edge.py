@@ -472,30 +472,33 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 LEAST_CHANGE, RUN_PX = 70.0, 9
 
 
-def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int]]:
+def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
-    film and background for a straight tip and a typical blur; and the first column of those that changed in runs, and
-    the one behind the last. A late beginning is better than an early one: neighbours then stand in for the background.
+    film and background for a straight tip and a typical blur; and the first column of those that changed in runs, the
+    one behind the last, and that in the last frame, which may be further on. A late beginning is better than an early
+    one: neighbours then stand in for the background.
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
     last, first = (np.sort(strip.brightness(frames), axis=0)[END_FRAMES // 2] for frames in ends)
-    changed, changed_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness([-1])[0]))
+    changed, by_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness([-1])[0]))
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
     votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, weight)
     path = dividing_path(votes)
     # Film stays. A payload that flies on, no longer than the tube is wide, leaves columns that changed and turned back.
-    for end, begin in itertools.pairwise([*changed_now.tolist(), len(first[0])]):
-        if begin - end > RUN_PX and changed_now[-1] - begin < len(first):
+    for end, begin in itertools.pairwise([*by_now.tolist(), len(first[0])]):
+        if begin - end > RUN_PX and by_now[-1] - begin < len(first):
             left, after = slice(end + RUN_PX // 2, begin - RUN_PX // 2), np.flatnonzero(path > end - RUN_PX)
             change = np.mean((strip.brightness(after)[:, :, left] - first[:, left]) ** 2, axis=1)
-            if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE * strip.noise**2 and changed[0] < end:
-                changed = changed[changed <= end]
-    passed = max(int(changed[0]), column_after_leap(path)), int(changed[-1]) + 1
-    if passed[0] >= passed[1]:
+            if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE * strip.noise**2:
+                changed, by_now = changed[changed <= end], by_now[by_now <= end]
+                break
+    first_column, last_column = max(min(changed, default=0), column_after_leap(path)), max(changed, default=-1)
+    if first_column > last_column:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    return straight_tip(strip, _with_run_up(np.clip(path, *passed))), passed
+    passed = int(first_column), int(last_column) + 1, int(max(last_column, by_now[-1])) + 1
+    return straight_tip(strip, _with_run_up(np.clip(path, *passed[:2]))), passed
 
 
 def _changed_columns(change: NDArray[np.float32], noise: float) -> Indices:
@@ -559,7 +562,7 @@ class EdgeTracker(Tracker):
             # Take over the fitted edges, and hold them at rest; blur lengths, film and background follow from them.
             fitted = np.flatnonzero(informative_frames(state.edge))
             edge = np.where(np.isfinite(before), before, state.edge)
-            edge = edge[np.clip(np.arange(len(edge)), fitted[0], fitted[-1])]
+            edge = np.minimum(edge[np.clip(np.arange(len(edge)), fitted[0], fitted[-1])], passed[2] + 2)
             state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
             state = estimate_appearance(strip, state, 4 * strip.noise + 4)
             informative = informative_frames(state.edge)
@@ -594,7 +597,7 @@ class Outline:
     width_px: float
     width_sigma_px: float
     state: EdgeState
-    passed: tuple[int, int]
+    passed: tuple[int, int, int]
     places_px: Floats
     middles_px: Floats
 
@@ -704,7 +707,7 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
 
 
 def _path_by_appearance(
-    strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int]
+    strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int, int]
 ) -> tuple[Floats, NDArray[np.float32]]:
     """Find the monotone path that best divides film from background between the columns that it passes, and what an
     edge costs at each column of a frame, (n_frames, n_along). Distances from either, in standard deviations of a pixel
@@ -727,7 +730,7 @@ def _hidden_px(contrast: NDArray[np.float32], edge: Floats, tube: Outline) -> Fl
     and behind it. Shapes: contrast (n_along,), of every column; edge (n_frames,) → (n_frames,).
     """
     # 0.15: part of the usual contrast above which a column tells on which side the edge is: half or twice it the same
-    first, behind = tube.passed
+    first, behind, _ = tube.passed
     telling = contrast > 0.15 * np.median(contrast[first:behind])
     telling[:first] = telling[behind:] = True
     places, near = np.flatnonzero(telling), BORDER_GAP_PX
@@ -736,7 +739,7 @@ def _hidden_px(contrast: NDArray[np.float32], edge: Floats, tube: Outline) -> Fl
     return np.maximum(after - before - 2 * near - 2, 0) / math.sqrt(12)
 
 
-def _elsewhere_px(strip: Strip, state: EdgeState, fit: Floats, edge: Floats, passed: tuple[int, int]) -> Floats:
+def _elsewhere_px(strip: Strip, state: EdgeState, fit: Floats, edge: Floats, passed: tuple[int, int, int]) -> Floats:
     """How far away the pixels of a frame put its edge, where a whole column of them says so; 0 in other frames. A path
     that never retreats is wrong there: it runs along no tube, or the tube draws back. Within reach of the tip, which
     looks unlike film and background, the edge must fit no worse there too. Not behind the first column passed, whose
@@ -752,7 +755,7 @@ def _elsewhere_px(strip: Strip, state: EdgeState, fit: Floats, edge: Floats, pas
     found, distance = search_edges(strip, state, away, best[away] - 0.5), np.zeros(len(edge))
     beyond_tip = np.abs(best - edge)[away] > SHADING_REACH_PX + state.lag.max()
     distance[away] = np.where(beyond_tip | (found[:, 2] <= fit[away, 2]), np.abs(best - edge)[away], 0.0)
-    return distance
+    return np.maximum(distance, edge - passed[2] - 2)
 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, tube: Outline) -> Positions:
