@@ -14,16 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import stdtr, stdtrit
 
 from vinetrack.core.records import Floats
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
@@ -53,9 +50,7 @@ class Points:
 
 
 def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Fit the law to the steady windows by both methods, and exactly as published. Returns `log_log`, `both_axes`,
-    `paper`, each as `fit_damping` describes.
-    """
+    """Fit the law to the steady windows by both methods, and exactly as published (`log_log`, `both_axes`, `paper`)."""
     fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
@@ -130,8 +125,6 @@ def _refusal(reason: str, left_out: dict[str, str]) -> dict[str, Any]:
 
 
 def _logarithms(points: pd.DataFrame) -> Points:
-    import pandas as pd
-
     sigmas = ["x_ss_sigma_m_s", "force_sigma_N", "yield_force_sigma_N", "scale_rel_sigma"]
     numbers = points.reindex(columns=["x_ss_m_s", "force_N", *sigmas]).to_numpy(float).T
     speed, force, speed_sigma, force_sigma, yield_sigma, scale_sigma = np.nan_to_num(numbers)
@@ -318,8 +311,6 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`, `sizes`, `B`, `power` and
     `line` (see `regress`), and `refused` (None, or why there is no regression).
     """
-    import pandas as pd
-
     vines = damping["both_axes"]["vines"]
     table = pd.DataFrame(
         [{"vine": name, **law} for name, law in vines.items()],
@@ -360,9 +351,7 @@ def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
-    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Shapes: x,
-    y (n,).
-    """
+    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p of the slope. Shapes (n,)."""
     (intercept, slope), (intercept_95, slope_95), (_, p), r_squared = _least_squares([x], y)
     line = {"slope": slope, "slope_95": slope_95, "intercept": intercept, "intercept_95": intercept_95}
     return line | {"R2": r_squared, "p": p, "n": int(x.size)}

@@ -45,9 +45,7 @@ class Release:
 
 @dataclass(frozen=True)
 class Window:
-    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady.
-    Speeds are those of the tail.
-    """
+    """A window tested by one rule; speeds of the tail. `doubtful`: the user's choice, though not shown steady."""
 
     rule: str
     accepted: bool
@@ -427,9 +425,7 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
 
 
 def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
-    """Find the longest window after the highest speed in which inertia is a small part of the force. Shapes:
-    pressure_Pa (n,).
-    """
+    """Find the longest window after the highest speed with little inertia in the force. Shapes: pressure_Pa (n,)."""
     parts = 3  # parts of a window in which inertia is fitted separately (chosen)
     fewest_points = 4 * parts
     trial, kinematics = motion.trial, motion.kinematics

@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.records import Floats, Indices, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
@@ -40,10 +41,6 @@ from vinetrack.kinematics.steady import (
 )
 from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.tracks.position_noise import correlated, position_noise
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 # ------------------------------------------------------------------------------
 # Velocity of the leading edge by Savitzky–Golay smoothing with a window chosen for each point.
@@ -151,9 +148,7 @@ WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows,
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
-    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track, two or more,
-    whose times increase.
-    """
+    """Estimate the motion of the leading edge at the usable points of a track, two or more, whose times increase."""
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
     noise_m, rho = position_noise(time_s, position_m)
@@ -244,8 +239,6 @@ def condition_table(
     trials: pd.DataFrame, known: Sequence[Trial], *, final_at_fraction: float, efficiency_at_mm: float
 ) -> pd.DataFrame:
     """Return a row for each condition, columns `CONDITION_COLUMNS`, in the order of the sheet."""
-    import pandas as pd
-
     measured = trials[trials["status"].isin(["ok", "warning"])]
     first = {trial.condition: trial for trial in reversed(known)}
     tables = {name: group.set_index("trial") for name, group in measured.groupby("condition", sort=False)}
@@ -307,9 +300,7 @@ def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float
 
 
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
-    """Return the velocity with which the leading edge first passes a position, interpolated linearly in position.
-    Shapes: lead_position_m, lead_velocity_m_s (n,).
-    """
+    """Lead velocity where the edge first passes a position, linear between points; NaN if it does not. Shapes (n,)."""
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
         return math.nan
@@ -352,9 +343,7 @@ class TrialError(ValueError):
 
 @dataclass(frozen=True)
 class TrialResult(TrialMotion):
-    """Results of one trial under a model. `row` has the columns of `trials.csv`, `point` those of the damping fit, with
-    `used` and the `reason` if not.
-    """
+    """Results of one trial under a model: its `row` of `trials.csv`, and its `point` of the damping fit."""
 
     row: Mapping[str, object]
     point: Mapping[str, object]
@@ -501,8 +490,6 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
     """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
     cannot be analysed under the model are left out.
     """
-    import pandas as pd
-
     rows, reasons = [], []
     for motion in motions:
         try:
@@ -517,8 +504,6 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """Return laws under several models as one table: a row for each model, method and vine; SI."""
-    import pandas as pd
-
     rows = [
         (name, method, vine, law["n"], *law["n_95_total"], vine_law["B"], *vine_law["B_95_total"], vine_law["n_trials"])
         for name, methods in laws.items()

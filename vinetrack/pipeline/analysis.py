@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import INTERNAL_ERROR, InputError, confirmed, remark
 from vinetrack.core.records import Track, Trial
@@ -84,7 +85,6 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -184,8 +184,6 @@ def _bare_row(name: str, status: str, reason: str, trial: Trial | None = None) -
 
 def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any]) -> dict[str, Any]:
     """Write the tables of a trial, without results headers only; return what it adds to those of the experiment."""
-    import pandas as pd
-
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
     if summary is None:
         track, kinematics = table_of(TRACK_COLUMNS), table_of(KINEMATICS_COLUMNS)
@@ -263,9 +261,7 @@ def fit_damping(job: Job) -> list[str]:
 
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Gather the results of all trials in `trials.csv`, `conditions.csv` and `steady.csv`. Returns the first of these,
-    and the points of the damping law.
-    """
+    """Gather all trials in `trials.csv`, `conditions.csv`, `steady.csv`; return the first, and points of the law."""
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     if experiment.settings.axis is None:
@@ -446,8 +442,6 @@ def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
     if its error there is the same, so that it is of the same trials.
     """
-    import pandas as pd
-
     former = next((read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0])
     known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
     for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
@@ -475,8 +469,6 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     origin are fitted per trial. Returns each trial under the initial model, and a table: s and m, `model_after_m` NaN
     if no effect was added.
     """
-    import pandas as pd
-
     final = {} if after is before else {one.name: one.predicted_position_m for one in _followed(after)}
     found = []
     for one in _followed(before):

@@ -146,9 +146,7 @@ def _frames_are(frames: int) -> str:
 
 
 def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> tuple[int, int, bool] | None:
-    """The first fault on a row beyond `after`: that row, by how many frames the times from there on are early, and
-    whether it repeats the row before.
-    """
+    """The first fault beyond a row: its row, how many frames early times are from there on, whether it is a copy."""
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None

@@ -388,9 +388,7 @@ class LocalFit:
 
 
 def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
-    """Compare every point with a robust cubic through its twelve nearest neighbours. Shapes: time_s, position_m
-    (n_points,).
-    """
+    """Compare every point with a robust cubic through its twelve neighbours. Shapes: time_s, position_m (n_points,)."""
     n = time_s.size
     begin = np.clip(np.arange(n) - HALF_WIDTH, 0, n - FEWEST_POINTS)
     places = begin[:, None] + np.arange(FEWEST_POINTS)
@@ -531,9 +529,7 @@ FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Standard deviations `sd_m` of every point, one array, shape (n_points,), for each trial. `blur_s` is τ, 0 where
-    the standard deviations follow those stated.
-    """
+    """Standard deviations of each trial's points, (n_points,); `blur_s` is τ, or 0 where they follow those stated."""
 
     sd_m: tuple[Floats, ...]
     blur_s: float
@@ -541,9 +537,7 @@ class NoiseShape:
 
 @dataclass(frozen=True)
 class _Differences:
-    """Fourth differences of a trial, scaled to the noise of one position, m; which are used; speeds, m/s. All arrays
-    have shape (n_points,).
-    """
+    """Fourth differences of a trial, m, scaled to the noise of a position; which are used; speeds, all (n_points,)."""
 
     distance_m: Floats
     use: np.ndarray
@@ -553,9 +547,7 @@ class _Differences:
 def noise_shape(
     time_s: Sequence[Floats], position_m: Sequence[Floats], stated_m: Sequence[Floats | None]
 ) -> NoiseShape | None:
-    """Find how the noise of an experiment's tracks varies; None where equal noise describes them as well. Shapes:
-    time_s, position_m (n_points,).
-    """
+    """Find how the noise of tracks varies; None where equal noise describes them as well. Shapes (n_points,) each."""
     if not time_s or min(times.size for times in time_s) < FEWEST_POINTS:
         return None
     differences = [_differences(t, y) for t, y in zip(time_s, position_m, strict=True)]

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,8 +54,6 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     """Find the corners of a ChArUco board in the picture (px) and on the board (m), both of shape (n, 2). Boards
     printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
     """
-    import cv2
-
     grey, dictionary = eight_bits(picture), _dictionary(board.dictionary)
     corners, ids = _detect_markers(grey, dictionary)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
@@ -77,11 +76,7 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
-    """Find the inner corners of a checkerboard in the picture (px), all of which must be there, and on the board (m),
-    both of shape (n, 2).
-    """
-    import cv2
-
+    """Find all inner corners of a checkerboard in the picture (px) and on the board (m), both of shape (n, 2)."""
     grey, (across, down) = eight_bits(picture), board.squares
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for columns, rows in dict.fromkeys([(across, down), (down, across)]):
@@ -109,11 +104,7 @@ def _not_as_stated(picture: NDArray[Any], found: str) -> CalibrationError:
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
-    """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is
-    none.
-    """
-    import cv2
-
+    """Count the squares across and down of a checkerboard, as far as visible; None where there is none."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     if not seen:
@@ -126,8 +117,6 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
 
 def _dictionary(name: str) -> Any:
     """A dictionary of markers by its name in OpenCV."""
-    import cv2
-
     code = getattr(cv2.aruco, name, None)
     if code is None:
         raise CalibrationError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
@@ -140,8 +129,6 @@ def _best_layout(
     """Share of the markers that lie where a board has them, their size (mm) beside squares of `square_mm`, and its
     layout: as OpenCV prints it from version 4.6, or as before.
     """
-    import cv2
-
     found = []
     for legacy in (False, True):
         layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
@@ -156,8 +143,6 @@ def _detect_markers(
     """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1), from the picture or a larger copy,
     for squares that are only a few pixels wide. Pixel 0 of a copy is centred on ½/enlarge − ½ of the picture's.
     """
-    import cv2
-
     copy = cv2.resize(grey, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(copy)
     if ids is None:
@@ -169,8 +154,6 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
     """Share of markers where the board has them, and their size (mm) when squares are `square_mm`. The centres of the
     markers fix the plane whatever their size; sizes are then measured in that plane.
     """
-    import cv2
-
     places = {
         int(key): np.array(square)[:, :2] for key, square in zip(layout.getIds(), layout.getObjPoints(), strict=True)
     }
@@ -193,9 +176,7 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
 
 
 def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floats]:
-    """Corners and their places on the board to a micrometre, both of shape (n, 2), unless they are too few or on one
-    line.
-    """
+    """Corners, and their places on the board to a micrometre, (n, 2) each, unless they are too few or on one line."""
     if len(grid_m) >= FEWEST_CORNERS:
         grid_m = 1e-6 * np.rint(1e6 * grid_m)
         if min(len(np.unique(grid_m[:, k])) for k in (0, 1)) > 1:
@@ -294,9 +275,7 @@ class PlaneMap:
         return self._plane_m(self.parameters, picture_px)
 
     def path_rel_sigma(self, places_px: Floats) -> float:
-        """Return the relative standard error of the length of a path in the plane, from the covariance. Shapes:
-        places_px (n, 2).
-        """
+        """Relative standard error of the length of a path in the plane, from the covariance; its places are (n, 2)."""
         gradient = np.zeros(self.parameters.size)
         steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
         for k, step in enumerate(steps):
@@ -309,8 +288,6 @@ class PlaneMap:
         return float(np.sqrt(max(variance, 0.0)) / length_along(self.plane_m(places_px))[-1])
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
-        import cv2
-
         until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12
         camera, lens = _camera(self.width_px, self.height_px), np.append(parameters[N_PLANE:], (0.0, 0.0))
         points = np.ascontiguousarray(picture_px, dtype=float).reshape(-1, 1, 2)
@@ -330,10 +307,7 @@ def _homography(parameters: Floats) -> Floats:
 
 
 def fit_plane(corners_px: Floats, board_m: Floats, width_px: int, height_px: int) -> tuple[PlaneMap, float]:
-    """Fit plane and lens to the corners of a board; also return the root mean square reprojection error, px. Shapes:
-    corners_px, board_m (n, 2).
-    """
-    import cv2
+    """Fit plane and lens to corners of a board, (n, 2) each; also return the rms reprojection error, px."""
     from scipy.optimize import least_squares
 
     camera, still, reach_m = _camera(width_px, height_px), np.zeros(3), float(np.ptp(board_m, axis=0).max())
@@ -405,9 +379,7 @@ class PlaneCalibration:
         return self.along(self._middle_line()).scale_rel_sigma
 
     def along(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
-        """Return scale and position along an axis: the arc length of a curve in the plane, not of its chord, which
-        `off_px` across it changes.
-        """
+        """Scale and position along an axis: a curve's arc length in the plane, not its chord; `off_px` changes it."""
         places_px, along_px = np.array([axis.from_px, axis.to_px]), np.array([0.0, axis.length_px])
         if axis.bends:
             # 4.0: length of the chords over which a curve is summed in the plane (derived)

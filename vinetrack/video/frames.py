@@ -116,9 +116,7 @@ def damaged_frames(shots: Sequence[Shot], slot: Indices, complained: bool) -> Bo
 
 
 class PacketIndex(NamedTuple):
-    """All frames of a film in display order: their times in ticks, and whether each is a key frame. Shapes
-    (n_frames,).
-    """
+    """All frames of a film in display order: time in ticks, and whether it is a key frame. Shapes (n_frames,)."""
 
     ticks: NDArray[np.int64]
     key: Bools
@@ -353,9 +351,7 @@ def shots_of(
 
 
 def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -> NDArray[Any]:
-    """Write pictures straight into one array, for `count` of them or longer where more come, unless they do not fit in
-    memory.
-    """
+    """Write pictures straight into one array, for `count` of them, longer if more come, unless memory is too small."""
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
     luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
@@ -544,9 +540,7 @@ def unpack_pixels(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
 
 
 def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
-    """Return the brightness of a sensor with a colour filter array, for any 2 by 2 pattern: a [1 2 1] kernel both ways.
-    Shapes: mosaic (height, width).
-    """
+    """Brightness of a sensor with any 2 by 2 colour mosaic: a [1 2 1] kernel both ways. Shape (height, width)."""
     import cv2
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)

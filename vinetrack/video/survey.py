@@ -277,9 +277,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """Report a stated exposure that the blur of the moving edge contradicts: a warning, or an error where it is twice
-    as much as is allowed.
-    """
+    """A stated exposure that the blur of the moving edge contradicts: a warning, at twice what is allowed an error."""
     allowed_px = 3.0  # Difference of the blur lengths of stated and seen exposure (measured)
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
@@ -336,9 +334,7 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
 
 
 class Surveyor:
-    """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
-    trials whose recordings were tracked.
-    """
+    """Opens the recordings of an experiment: the `facts` of each by trial, and the trials `looked_into` by tracking."""
 
     def __init__(self, keep: Keep | None = None) -> None:
         self.keep = keep
