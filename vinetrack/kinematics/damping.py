@@ -137,11 +137,9 @@ def _logarithms(points: pd.DataFrame) -> Points:
     )  # fmt: skip
 
 
-def slope(
-    log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
-) -> tuple[Floats, Floats]:
+def slope(counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats) -> tuple[Floats, Floats]:
     """York's slope n, (n_resamples,), with one intercept ln B for each vine, for many resamples at once. Shapes:
-    log_force, counts (n_resamples, n_points); speed_variance, force_variance (n_points,).
+    counts (n_resamples, n_points); speed_variance, force_variance (n_points,).
     """
     member = data.member
     n = np.full(counts.shape[0], 0.4)
@@ -153,9 +151,9 @@ def slope(
             weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
             total = weight @ member
             mean_x = (weight * data.log_speed) @ member / total
-            mean_y = (weight * log_force) @ member / total
+            mean_y = (weight * data.log_force) @ member / total
             dx = np.where(drawn, data.log_speed - mean_x[:, data.vine], 0.0)
-            dy = np.where(drawn, log_force - mean_y[:, data.vine], 0.0)
+            dy = np.where(drawn, data.log_force - mean_y[:, data.vine], 0.0)
             lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / multiplicity
             update = np.sum(lever * dy, axis=1) / np.sum(lever * dx, axis=1)
             has_converged = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
@@ -171,8 +169,8 @@ def _fit(
     n_points, n_vines = data.log_force.size, len(data.names)
     dof = n_points - n_vines - 1
     speed_variance, force_variance = _variances(data, dof, both_axes)
-    everything = np.ones((1, n_points))
-    exponents, log_B = slope(data.log_force[None], everything, data, speed_variance, force_variance)
+    ones = np.ones(n_points)
+    exponents, log_B = slope(ones[None], data, speed_variance, force_variance)
     n, log_B = float(exponents[0]), log_B[0]
     if not (math.isfinite(n) and n > 0):
         return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
@@ -203,8 +201,7 @@ def _fit(
         low, high = estimate - half_width, estimate + half_width
     if not both_axes:
         # N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F
-        ones = np.ones_like(data.log_force)
-        steep, steep_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
+        steep, steep_B = slope(ones[None], data, ones, 1e-14 * ones)
         shift = np.concatenate([steep, steep_B[0]]) - estimate
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
     by_shared = 1.959964 * np.sqrt(np.sum(moved**2, axis=1))
@@ -257,7 +254,7 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
     scatter, n = 1e-3, np.array([0.4])
     for _ in range(60):
         speed_variance = data.speed_error**2 + (data.set_error**2 + scatter) / n[0] ** 2
-        n, log_B = slope(data.log_force[None], ones, data, speed_variance, force_variance)
+        n, log_B = slope(ones, data, speed_variance, force_variance)
         if not (math.isfinite(n[0]) and n[0] > 0):
             break
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
@@ -276,7 +273,7 @@ def _resample(data: Points, speed_variance: Floats, force_variance: Floats, resa
     for i in range(len(data.names)):
         rows = np.flatnonzero(data.vine == i)
         counts[:, rows] = random.multinomial(rows.size, np.full(rows.size, 1 / rows.size), size=resamples)
-    n, log_B = slope(data.log_force[None], counts, data, speed_variance, force_variance)
+    n, log_B = slope(counts, data, speed_variance, force_variance)
     draws = np.column_stack([n, log_B])
     return draws[np.isfinite(draws).all(axis=1) & (n > 0)]
 

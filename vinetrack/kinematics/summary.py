@@ -68,7 +68,6 @@ class WindowFits:
     half_s: Floats
     covariance: Floats
     misfit: Floats
-    misfit_terms: int
 
     def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
         """Evaluate the polynomials of given windows at given times. Returns position, velocity, acceleration, shape (3,
@@ -102,7 +101,7 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
-    weights, even_covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    weights, even_covariance = _scaled(_even_design(width, order), order, rho)
     covariance = np.repeat(even_covariance[0][:, :, None], m, axis=2)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
     # Odd windows contain a spacing different from the median, by more than 1 % (chosen).
@@ -112,36 +111,36 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
         u = (time_s[take] - middle[odd, None]) / half[odd, None]
-        uneven_weights, uneven_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        uneven_weights, uneven_covariance = _scaled(_solve_design(u, order), order, rho)
         results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
         covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
-    return WindowFits(width, results[: order + 1], middle, half, covariance, misfit, terms)
+    return WindowFits(width, results[: order + 1], middle, half, covariance, misfit)
 
 
-def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
+def _scaled(weights: Floats, order: int, rho: float) -> tuple[Floats, Floats]:
     """Weights with the misfits scaled to unit variance, and the covariance of the coefficients, under AR(1) noise."""
     coefficients, extra = weights[:, : order + 1], weights[:, order + 1 :]
     covariance = correlated(coefficients, rho) @ coefficients.transpose(0, 2, 1)
     spread = np.sqrt(np.sum(correlated(extra, rho) * extra, axis=2, keepdims=True))
-    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
+    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance
 
 
 @lru_cache(maxsize=64)
-def _even_design(width: int, order: int) -> tuple[Floats, int]:
+def _even_design(width: int, order: int) -> Floats:
     """The design shared by all evenly spaced windows of a width."""
     return _solve_design(np.linspace(-1, 1, width)[None, :], order)
 
 
-def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
-    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
+def _solve_design(u: Floats, order: int) -> Floats:
+    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w)."""
     # 4: orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
     terms = min(4, u.shape[1] - order - 1)
     q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
     q = q.transpose(0, 2, 1)
     inside = q[:, : order + 1]
     coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
-    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
+    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1)
 
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
@@ -179,9 +178,9 @@ def smooth(
     least = min(n, max(WINDOWS[0], order + 2))
     widths = [least, *(width for width in WINDOWS if least < width <= n)]
     fits = [fit_all_windows(time_s, position_m, width, min(order, width - 1), rho) for width in widths]
-    # Largest misfit of a window that fits its points, by number of terms (derived)
+    # Largest misfit of a window that fits its points, by the points that it has beyond its coefficients (derived)
     limits = (np.inf, 12.0, 15.3, 18.0, 20.5)
-    fits_points = [fit.misfit <= noise_m**2 * limits[fit.misfit_terms] for fit in fits]
+    fits_points = [fit.misfit <= noise_m**2 * limits[min(fit.width - len(fit.coefficients), 4)] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
     # Range of velocities on which the centred windows agree, from the narrowest up, and the least error; unbounded
     # where not even the narrowest window fits its points: then one-sided windows decide.
