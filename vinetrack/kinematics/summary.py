@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Indices, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
@@ -336,10 +337,6 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]
     return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
 
 
-class TrialError(ValueError):
-    """A trial that cannot be analysed; the message is a sentence for its `reason`."""
-
-
 @dataclass(frozen=True)
 class TrialResult(TrialMotion):
     """Results of one trial under a model: its `row` of `trials.csv`, and its `point` of the damping fit."""
@@ -361,7 +358,7 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     """Find velocity, release and the windows that do not depend on a model."""
     usable = int(track.usable.sum())
     if usable < FEWEST_POINTS:
-        raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
+        raise UserError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
     kinematics = estimate_kinematics(
         track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
     )
@@ -393,10 +390,7 @@ def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
     """Compute velocity, steady windows by every rule, force, final speed and efficiency of one trial."""
     motion = look_at_motion(trial, track, settings)
-    try:
-        steady = steadiness_under(motion, model)
-    except EffectError as error:
-        raise TrialError(str(error)) from error
+    steady = steadiness_under(motion, model)
     track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.window
     moved_m = track.lead_position_m[track.usable]
     # Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there
@@ -480,7 +474,7 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings)
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
     motions = []
     for trial, track in pairs:
-        with suppress(TrialError):
+        with suppress(UserError):
             motions.append(look_at_motion(trial, track, settings))
     return motions
 

@@ -458,7 +458,7 @@ class _Answer(_Quiet):
             self.set_status(HTTPStatus.OK)
         except ExperimentError as error:
             content = {"problems": [_problem_json(problem) for problem in error.problems], "words": str(error)}
-        except (UserError, RecordingError) as error:
+        except UserError as error:
             content = {"words": str(error)}
         except (KeyError, ValueError, TypeError, OSError) as error:
             log.exception("%s", self.request.path)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from vinetrack.core.problems import INTERNAL_ERROR, InputError, confirmed, remark
+from vinetrack.core.problems import INTERNAL_ERROR, InputError, UserError, confirmed, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
@@ -51,7 +51,6 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_half_steady, mark_left_out
 from vinetrack.kinematics.summary import (
-    TrialError,
     TrialMotion,
     TrialResult,
     condition_table,
@@ -62,7 +61,7 @@ from vinetrack.kinematics.summary import (
 )
 from vinetrack.narrative.diagnosis_text import damping_headline, failures_told, proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
-from vinetrack.pipeline.workflow import Job, Kept, map_unordered
+from vinetrack.pipeline.workflow import Job, Kept, Say, map_unordered
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results import (
     KINEMATICS_COLUMNS,
@@ -127,7 +126,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             track, columns, view = _of_recording(trial, measurement, experiment)
             summary = summarise_trial(trial, track, settings, model_of(experiment))
-    except (RecordingError, InputError, TrialError) as error:
+    except UserError as error:
         from_file = trial.track if trial is not None and trial.video is None and isinstance(error, InputError) else None
         reason = f"{from_file.name} {error}" if from_file else str(error)
     except Exception as error:
@@ -371,11 +370,9 @@ def _reason(error: Exception) -> str:
 # ------------------------------------------------------------------------------
 # Diagnosis of a results folder: which effects the model lacks, and how much they reduce its errors.
 
-Report = Callable[[str], None]
-
 
 def diagnosed(
-    experiment: Experiment, results: Results, pairs: Pairs, report: Report, fitted: Fit | None = None
+    experiment: Experiment, results: Results, pairs: Pairs, report: Say, fitted: Fit | None = None
 ) -> Diagnosis:
     """The diagnosis of these trials as the experiment asks for it, with what contradicts its sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
@@ -487,7 +484,7 @@ def _followed(fit: Fit) -> Sequence[TrialFit]:
         return ()
 
 
-def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
+def propose_effect(experiment: Experiment, folder: Path, report: Say) -> tuple[list[str], list[Path]]:
     """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
     results = Results(folder)
     diagnosis = read_diagnosis(results)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
 
@@ -217,7 +218,7 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     return odd
 
 
-class RecordingError(ValueError):
+class RecordingError(UserError, ValueError):
     """A recording that cannot be used: whose it is, what is wrong and what to do; together they are one sentence."""
 
     def __init__(self, message: str, remedy: str = "", name: str = "") -> None:
