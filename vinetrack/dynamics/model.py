@@ -184,9 +184,6 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
     """Parameters of a model as those of a larger one, others at `zero`. Shapes: (n_trials, n_parameters of each)."""
-    lacking = [name for name in model.names if name not in host]
-    if lacking:
-        raise EffectError(f"The host model has no effect {', '.join(lacking)}.")
     wider = np.tile(host.zeros, (len(parameters), 1))
     wider[:, [host.parameter_names.index(name) for name in model.parameter_names]] = parameters
     return wider

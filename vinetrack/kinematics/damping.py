@@ -175,7 +175,7 @@ def _fit(
     if not (math.isfinite(n) and n > 0):
         return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
     residual = data.log_force - log_B[data.vine] - n * data.log_speed
-    scatter = math.sqrt(float(residual @ residual) / dof) if dof > 0 else math.nan
+    scatter = math.sqrt(float(residual @ residual) / dof)
     # Covariance of n and ln B, from the curvature of χ² at its minimum
     design = np.column_stack([data.log_speed, data.member])
     variance = force_variance + n**2 * speed_variance if both_axes else np.full(n_points, scatter**2)
@@ -185,7 +185,7 @@ def _fit(
     moved = covariance @ (design.T / variance) @ shared
     estimate = np.concatenate([[n], log_B])
     # 10: fewest points for bootstrap intervals (chosen)
-    if n_points >= 10 and dof > 0:
+    if n_points >= 10:
         interval = "resampling whole trials"
         draws = _resample(data, speed_variance, force_variance, resamples, seed)
         # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter
@@ -243,11 +243,12 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
 
     def scatter_of(residual: Floats, stated: Floats) -> float:
         """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
-        squares, ends = residual**2, (1e-12, float(residual @ residual) / max(dof, 1) + 1e-12)
-        low, high = (float(np.sum(squares / (stated + s))) - max(dof, 1) for s in ends)
-        if not low > 0 > high:
-            return ends[0]
-        return float(brentq(lambda s: float(np.sum(squares / (stated + s))) - max(dof, 1), *ends))
+        squares, ends = residual**2, (1e-12, float(residual @ residual) / dof + 1e-12)
+
+        def excess(s: float) -> float:
+            return float(np.sum(squares / (stated + s))) - dof
+
+        return float(brentq(excess, *ends)) if excess(ends[0]) > 0 > excess(ends[1]) else ends[0]
 
     ones = np.ones((1, data.log_force.size))
     force_variance = data.force_error**2
@@ -447,8 +448,6 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     refused = None
     if n == 0:
         refused = "no condition has such a value above 0"
-    elif not varying:
-        refused = "all vines are of one size"
     elif dof < 1:
         refused = f"{n} conditions are too few for powers of {words} with errors: it takes {len(varying) + 2}"
     elif np.linalg.matrix_rank(matrix) < matrix.shape[1]:

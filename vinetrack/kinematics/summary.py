@@ -483,14 +483,12 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
     """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
     cannot be analysed under the model are left out.
     """
-    rows, reasons = [], []
+    rows = []
     for motion in motions:
-        try:
+        with suppress(EffectError):
             rows.append(damping_point(motion.trial, steadiness_under(motion, model)))
-        except EffectError as error:
-            reasons.append(str(error))
     if not rows:
-        raise ValueError(f"no trial can be analysed under this model: {'; '.join(reasons) or 'there is none'}")
+        raise ValueError("no trial can be analysed under this model")
     points = mark_half_steady(pd.DataFrame(rows))
     return fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
 

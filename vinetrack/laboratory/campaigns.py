@@ -215,10 +215,7 @@ def render_recording(
     renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
     camera, encoding, depth = scene.camera, scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
-    of_grey = {8: "gray", 12: "gray12le", 16: "gray16le"}
-    pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else of_grey.get(depth)
-    if pixel_format is None:
-        raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
+    pixel_format = "yuv420p" if is_h264 else {8: "gray", 12: "gray12le", 16: "gray16le"}[depth]
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
     # The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene
     height, width = (camera.height_px + 1) // 2, (camera.width_px + 1) // 2

@@ -550,8 +550,7 @@ class SceneMotion:
     def door_angle_rad(self, time_s: float) -> float:
         """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop."""
         door = self.scene.door
-        if door is None or not math.isfinite(self.release_s):
-            return 0.0
+        assert door is not None
         opened = (time_s - self.release_s + door.lead_s) / door.swing_s
         if opened <= 0:
             return 0.0
@@ -726,11 +725,6 @@ class FrameRenderer:
     ) -> None:  # fmt: skip
         self.scene, self._seed = scene, seed
         self.exposure_s = scene.exposure_fraction / capture_fps if exposure_s is None else exposure_s
-        if not 0 < self.exposure_s <= 1 / capture_fps:
-            raise ValueError(
-                f"An exposure of {self.exposure_s * 1e6:.0f} µs does not fit between frames at {capture_fps:g} a "
-                "second; choose a shorter one."
-            )
         self._motion = SceneMotion(
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )

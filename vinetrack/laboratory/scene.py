@@ -288,6 +288,4 @@ def preset(name: str) -> Scene:
         "falling_ball": ball,
         "dark_ball": replace(ball, subject=Ball(brightness=0.06, texture=0.2, specular=0.8), backdrop=dark_wall),
     }
-    if name not in scenes:
-        raise ValueError(f"No scene is called {name!r}; choose one of {', '.join(scenes)}.")
     return scenes[name]
