@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -355,10 +356,7 @@ class AxisScale:
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """The result of a calibration. `m_per_px` and `scale_rel_sigma` hold across the middle of `covered_px` (left, top,
-    right, bottom: the target's corners, or the whole picture without one), along the picture's longer side; `along`
-    gives them for a growth axis.
-    """
+    """The result of a calibration; `covered_px` is left, top, right and bottom of the target, or of the picture."""
 
     kind: str
     plane: PlaneMap
@@ -368,15 +366,13 @@ class PlaneCalibration:
     covered_px: tuple[float, float, float, float]
     notes: tuple[str, ...] = ()
 
-    @property
-    def m_per_px(self) -> float:
-        """Scale across the middle of what the target covers, m/px."""
-        return self.along(self._middle_line()).m_per_px
-
-    @property
-    def scale_rel_sigma(self) -> float:
-        """Relative standard error of `m_per_px`; NaN where unknown."""
-        return self.along(self._middle_line()).scale_rel_sigma
+    @cached_property
+    def middle(self) -> AxisScale:
+        """The scale across the middle of what the target covers, along the picture's longer side."""
+        left, top, right, bottom = self.covered_px
+        if self.plane.width_px >= self.plane.height_px:
+            return self.along(Axis((left, (top + bottom) / 2), (right, (top + bottom) / 2)))
+        return self.along(Axis(((left + right) / 2, top), ((left + right) / 2, bottom)))
 
     def along(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
         """Scale and position along an axis: a curve's arc length in the plane, not its chord; `off_px` changes it."""
@@ -396,12 +392,6 @@ class PlaneCalibration:
         rel_sigma = math.hypot(self.plane.path_rel_sigma(places_px), self.own_rel_sigma)
         rel_sigma = math.hypot(rel_sigma, off_px * abs(axis.turn_rad) / axis.length_px)
         return AxisScale(float(path_m[-1]) / axis.length_px, rel_sigma, position_m)
-
-    def _middle_line(self) -> Axis:
-        left, top, right, bottom = self.covered_px
-        if self.plane.width_px >= self.plane.height_px:
-            return Axis((left, (top + bottom) / 2), (right, (top + bottom) / 2))
-        return Axis(((left + right) / 2, top), ((left + right) / 2, bottom))
 
 
 def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int) -> PlaneCalibration:

@@ -79,7 +79,7 @@ def measure_recording(
             calibration = _calibrated(settings.calibration, folder, recording.width, recording.height)
         except CalibrationError as error:
             raise RecordingError(error.what, error.remedy, "calibration") from error
-    m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
+    m_per_px = trial.m_per_px if calibration is None else calibration.middle.m_per_px
     axis = given_axis(trial, settings, m_per_px)
     diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
     exposure_s = capture_exposure(trial, recording)
@@ -361,7 +361,7 @@ class Surveyor:
             of_trial, m_per_px, rel_sigma = [], trial.m_per_px, math.nan
             scale = calibrations.get((opened[trial].width, opened[trial].height))
             if not math.isfinite(m_per_px) and scale is not None:
-                m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
+                m_per_px, rel_sigma = scale.middle.m_per_px, scale.middle.scale_rel_sigma
             axis = given_axis(trial, experiment.settings, m_per_px)
             facts = _stated_facts(trial, opened[trial], m_per_px, rel_sigma, axis)
             if trial in self.looked_into:
@@ -468,7 +468,7 @@ def _scale_problems(
     of_all = False  # whether the axis that all share was named, for the first picture that it does not fit
     for trial, recording in opened.items():
         scale = calibrations.get((recording.width, recording.height))
-        m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
+        m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.middle.m_per_px
         axis = given_axis(trial, settings, m_per_px)
         half_px = trial.diameter_m / m_per_px / 2 if axis is None or math.isnan(axis.width_px) else axis.width_px / 2
         if axis and (complaint := axis_problem(axis, half_px, (recording.width, recording.height))):
