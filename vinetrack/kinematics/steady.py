@@ -488,9 +488,7 @@ def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
 
 @dataclass(frozen=True)
 class SteadyForce:
-    """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure,
-    which all trials of a vine share.
-    """
+    """Force in a steady window, its random error, and the error by the yield pressure, which a vine's trials share."""
 
     force_N: float
     sigma_N: float

@@ -480,9 +480,7 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings)
 
 
 def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings) -> Mapping[str, Any]:
-    """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
-    cannot be analysed under the model are left out.
-    """
+    """The damping law, as in `damping.json`, with the pressure of a model, of all trials it can be computed for."""
     rows = []
     for motion in motions:
         with suppress(EffectError):

@@ -264,9 +264,7 @@ def mean_speed(track: Track) -> float:
 
 
 def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
-    """Say which tracks are longer than their vine, whose tip cannot run farther, as a payload can that leaves it; blank
-    where none is, or not surely.
-    """
+    """Say which tracks are longer than their vine, beyond which no bare tip can run; blank where none is for sure."""
     travels: list[tuple[Trial, float]] = []
     for trial, track in pairs:
         position_m = track.lead_position_m[track.usable]

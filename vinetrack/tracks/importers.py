@@ -13,7 +13,8 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -23,10 +24,6 @@ from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flag
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
 from vinetrack.core.units import UNITS, number, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
 
 # ------------------------------------------------------------------------------
 # Checks that every imported track must pass, and how a track is assembled.
@@ -164,8 +161,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
     `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
     """
-    from xml.etree import ElementTree
-
     # Documents that define entities are refused: they can expand without end.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
@@ -209,7 +204,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     return new_track(time_s, position_m, [*notes, note], edge_px=edge_px)
 
 
-def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
+def _frame_values(node: ElementTree.Element, *names: str) -> dict[int, tuple[float, ...]]:
     """Numbers stored per frame under `framedata`; frames that lack one are left out."""
     values: dict[int, tuple[float, ...]] = {}
     for entry in node.findall("property[@name='framedata']/property"):
@@ -223,7 +218,7 @@ def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
+def _axes(panel: ElementTree.Element) -> dict[int, tuple[float, ...]]:
     """The coordinate systems by the frame from which they are valid: origin in px, angle in degrees, px per unit."""
     coords = _object(panel, "coords")
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
@@ -235,7 +230,7 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _clock(panel: Element) -> tuple[float, float, int]:
+def _clock(panel: ElementTree.Element) -> tuple[float, float, int]:
     """Seconds per frame, and time and number of the start frame."""
     clip, control = _object(panel, "videoclip"), _object(panel, "clipcontrol")
     video = None if clip is None else _object(clip, "video")
@@ -249,17 +244,17 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     return frame_ms / 1000, start_ms / 1000, int(start_frame)
 
 
-def _object(node: Element, name: str) -> Element | None:
+def _object(node: ElementTree.Element, name: str) -> ElementTree.Element | None:
     """The object stored in a property."""
     return node.find(f"property[@name='{name}']/object")
 
 
-def _text(node: Element, name: str) -> str:
+def _text(node: ElementTree.Element, name: str) -> str:
     """The text of a property, blank where there is none."""
     return node.findtext(f"property[@name='{name}']") or ""
 
 
-def _number(node: Element, name: str) -> float:
+def _number(node: ElementTree.Element, name: str) -> float:
     """A stored number; NaN where it is missing, is none or is beyond LARGEST_NUMBER."""
     try:
         value = float(_text(node, name) or "nan")
@@ -540,9 +535,7 @@ def track_lines(tracks: Iterable[tuple[Trial, Track]]) -> list[str]:
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
-    """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels. Returns times in s
-    and gauge pressures in Pa, two arrays, shape (n,).
-    """
+    """Times, s, and gauge pressures, Pa, (n,) each: a CSV with `time_s, pressure_kPa`, or a TDMS with such channels."""
     if path.suffix.lower() == ".tdms":
         time_s, pressure_Pa = _tdms_trace(path)
         lines: Sequence[int] = range(1, len(time_s) + 1)

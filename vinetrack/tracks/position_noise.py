@@ -262,9 +262,7 @@ def rest_points(position_m: Floats) -> int:
 
 
 def turning_point(position: Floats, back: Floats | float) -> int | None:
-    """Furthest point of a motion that turns back, behind which two points in a row then lie by more than `back`; None
-    where there is none. Shapes: position (n,).
-    """
+    """Furthest point before two in a row lie farther than `back` behind it; None if there are none. Shapes (n,)."""
     is_back = np.maximum.accumulate(position) - position > back
     turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     return int(np.argmax(position[: turned[0] + 1])) if turned.size else None
@@ -587,9 +585,7 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
 
 
 def _by_speed(differences: Sequence[_Differences]) -> tuple[float, NoiseShape] | None:
-    """−2 ln L of noise with the most likely τ of all trials together and s of each, and the standard deviations, by
-    the multiplicative updates of `_whittle`.
-    """
+    """−2 ln L of noise with the likeliest τ of all trials and s of each, by `_whittle`'s updates; and what it is."""
     trial = np.repeat(np.arange(len(differences)), [np.count_nonzero(part.use) for part in differences])
     square = np.concatenate([part.distance_m[part.use] for part in differences]) ** 2
     speed_square = np.concatenate([part.speed_m_s[part.use] for part in differences]) ** 2

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from vinetrack.core.process import progress, table
 from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.units import number
-from vinetrack.experiment.folder import SETTINGS, SHEET
+from vinetrack.experiment.folder import SETTINGS, SHEET, Experiment
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.tracks.importers import FEWEST_POINTS
@@ -33,10 +33,6 @@ from vinetrack.video.calibration import CalibrationError, PlaneCalibration, cali
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.track import Tracking, in_metres, too_few, track_pixels
-
-if TYPE_CHECKING:
-    from vinetrack.experiment.folder import Experiment
-
 
 # ------------------------------------------------------------------------------
 # Measure a recording: its track in metres by the experiment's calibration, and the error of the scale.
