@@ -58,9 +58,8 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
 
 
 def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
-    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`. At a pressure where
-    a vine barely reaches a steady speed within its length, only the slower trials are steady. Their B is larger than
-    average, which would bias the upper end of the fit.
+    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`: where a vine barely
+    gets steady within its length, only the slower trials do, whose larger B would bias the upper end of the fit.
     """
     eligible = points[points["eligible"]]
     share = eligible.groupby("condition", sort=False)["used"].mean()
@@ -368,10 +367,9 @@ def _least_squares(columns: Iterable[Floats], y: Floats) -> tuple[list[float], l
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
-    """Find families of conditions that differ only in size, and the trends of speed and efficiency with size. Returns
-    `steady_speed`: scaled copies without payload at one pressure, each family with `sizes` (mm), `x_ss_m_s`,
-    `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second in
-    `over_diameter`), `monotonic`, and `refused`.
+    """Find families of conditions that differ only in size, with the trends of speed and efficiency. `steady_speed` are
+    scaled copies without payload at one pressure, with `sizes` (mm), `x_ss_m_s`, `x_ss_over_diameter_1_s`, their
+    errors, `power` and `line` of both (see `regress`), `monotonic`, and `refused`.
     """
     return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
 

@@ -31,9 +31,8 @@ from vinetrack.tracks.position_noise import ar1_sd, rest_points
 
 @dataclass(frozen=True)
 class Release:
-    """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves.
-    `moving_from_start` marks tracks without rest, whose zeros are extrapolated or those of the first point; `reason`
-    says which.
+    """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves. A track
+    `moving_from_start` has no rest: `reason` says whether its zeros are extrapolated or those of its first point.
     """
 
     time_s: float
@@ -320,9 +319,8 @@ def _before_the_end(track: Track, position_m: Floats, first: int, last: int, len
 def _longest_steady(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, latest: int, drift_limit: float
 ) -> tuple[tuple[int, int] | None, str]:
-    """First and last point of the longest steady window up to `latest`, or the reason why there is none; of several
-    the one whose speed changes least. Windows shrink by half a per cent of the motion at a time. Shapes: time_s,
-    position_m (n,), the moving points.
+    """First and last point of the longest steady window up to `latest`, or why there is none; of several the one whose
+    speed changes least. Windows shrink by half a per cent of the motion at a time. Shapes: moving points, (n,).
     """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 

@@ -58,9 +58,8 @@ from vinetrack.tracks.position_noise import correlated, position_noise
 
 @dataclass(frozen=True)
 class WindowFits:
-    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
-    `coefficients` (order + 1, m), their `covariance` (order + 1, order + 1, m) for noise of 1 m; `middle_s`, `half_s`
-    (m,).
+    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half, middle
+    and half (m,): `coefficients` (order + 1, m), their `covariance` (order + 1, order + 1, m) for noise of 1 m.
     """
 
     width: int
@@ -309,9 +308,8 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 
 
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
-    """Return the ratio of kinetic energy to work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth. m(x) is
-    the moving mass of tail and payload, ẋ = r·ẏ. NaN where there is no work. Source: Alvarez et al. (2025), section
-    IV-D, with the moving mass of their Eq. (1).
+    """Kinetic energy over the work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth, with the moving mass
+    of tail and payload, ẋ = r·ẏ; NaN without work. Source: Alvarez et al. (2025), section IV-D, and their Eq. (1).
     """
     work_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     if not work_J > 0:
@@ -321,10 +319,9 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
 
 
 def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]:
-    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas: efficiency ×
-    the first is that of the payload alone, efficiency / (1 + the second) counts both works. The weight does work on
-    tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq. (2) of Alvarez et al.
-    (2025). NaN where there is no mass, or no work.
+    """The payload's fraction of the moving mass, for the efficiency of the payload alone, and the work of the weight
+    over that of the gas, for 1/(1 + it) of the efficiency with both works. The weight works on tail and payload along
+    the travel of the tail x = r·y: g cosθ ∫ m dx, as in Eq. (2) of Alvarez et al. (2025). NaN without mass, or work.
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m

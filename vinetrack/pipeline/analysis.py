@@ -462,9 +462,8 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
 
 
 def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
-    """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
-    origin are fitted per trial. Returns each trial under the initial model, and a table: s and m, `model_after_m` NaN
-    if no effect was added.
+    """Predict every trial with the initial and the final model; as in `comparison.csv`, only release and origin are
+    fitted per trial. Returns each trial under the first, and a table, s and m, `model_after_m` NaN if none was added.
     """
     final = {} if after is before else {one.name: one.predicted_position_m for one in _followed(after)}
     found = []

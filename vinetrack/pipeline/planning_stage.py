@@ -348,9 +348,8 @@ def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PowerRequest:
-    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
-    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
-    with each.
+    """Options of the command, NaN and None where not given; standard deviations between trials are relative. `effects`
+    are names, or `name=size` in the parameter's unit; `simulate` campaigns are simulated with each.
     """
 
     target: Path

@@ -205,9 +205,8 @@ def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float) -> t
 
 
 def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float) -> _Jump | None:
-    """Jump of position between two sides of a smooth motion. The widest sides that follow one parabola are used. None
-    where there are no such sides, where either moves slowly compared with the noise, or where their speeds differ so
-    much that a jump cannot be told from acceleration.
+    """Jump of position between two sides of a smooth motion, the widest that follow one parabola. None without such
+    sides, and where either is slow beside the noise, or so much faster that the jump may be acceleration.
     """
     for points in SIDE_POINTS:
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
@@ -236,9 +235,8 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
 
 
 def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float) -> float:
-    """Jump between points i and i + 1 from many more points on either side, NaN where those are inconclusive. They are
-    conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few nearby
-    outliers made up is then gone.
+    """Jump between points i and i + 1 from many more points on either side; NaN unless one cubic and a step follow all
+    of them to within the noise, which no jump outlives that a few outliers nearby made up.
     """
     first = max(i + 1 - WIDE_SIDE_POINTS, 0)
     near = slice(first, i + 1 + WIDE_SIDE_POINTS)

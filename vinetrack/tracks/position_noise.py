@@ -134,11 +134,10 @@ THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences
 
 
 def position_noise(time_s: Floats, position_m: Floats, *, robust: bool = False) -> tuple[float, float]:
-    """Estimate the standard deviation and lag-one correlation of the random error of single positions. `robust`: so
-    that a fault in a short track does not pass for noise, at most 1.84 times what the median third difference says,
-    which a single fault hardly changes; of positions that are rounded, and mostly at rest, it carries no information.
-    Returns noise_m (0 where the positions are exact or fewer than 5), correlation (0 to 0.95; shrunk to 0 where the
-    track is short). Shapes: time_s, position_m (n,).
+    """Standard deviation (0 where positions are exact, or fewer than 5) and lag-one correlation (0 to 0.95, shrunk to 0
+    in short tracks) of the random error of single positions. `robust`: so that a fault in a short track is no noise, at
+    most 1.84 times what the median third difference says, which a single fault hardly changes; it says nothing of
+    positions that are rounded, and mostly at rest. Shapes: time_s, position_m (n,).
     """
     if position_m.size < 5:
         return 0.0, 0.0
@@ -234,9 +233,8 @@ def rough_noise(position_m: Floats) -> float:
 
 
 def rest_points(position_m: Floats) -> int:
-    """Count the points at the start that are at rest; 0 where the track starts in motion. The track leaves rest where
-    it rises above the resting level for good; the corner is then that of the best flat-then-straight line through the
-    points up to there. Shapes: position_m (n,).
+    """Count the points at rest at the start; 0 where the track starts in motion. It leaves rest where it rises above
+    the resting level for good, at the corner of the best flat-then-straight line up to there. Shapes: position_m (n,).
     """
     n = position_m.size
     if n < 5:
@@ -437,9 +435,8 @@ def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
 
 
 def find_outliers(time_s: Floats, position_m: Floats) -> Bools:
-    """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
-    if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
-    (n_points,).
+    """Mark the points far off the motion around them: the largest deviations first, others only if they remain without
+    those, since an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) → (n_points,).
     """
     from scipy.special import stdtrit  # scipy.stats takes most of a second to load
 

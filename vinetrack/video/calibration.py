@@ -255,8 +255,7 @@ N_PLANE, N_LENS = 8, 2  # Parameters of a plane and of a lens (derived)
 @dataclass(frozen=True)
 class PlaneMap:
     """Map from pixels to the plane of growth. `parameters` are the first eight entries of the homography from
-    undistorted half-diagonals to metres, row by row (the ninth is 1), then κ₁ and κ₂; `covariance`, shape (10, 10), is
-    their covariance.
+    undistorted half-diagonals to metres, by rows (the ninth is 1), κ₁ and κ₂; `covariance` is theirs, (10, 10).
     """
 
     width_px: int
@@ -344,9 +343,8 @@ CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
 
 @dataclass(frozen=True)
 class AxisScale:
-    """The calibration along one growth axis. `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative
-    standard error (NaN where unknown); `position_m` maps points of the picture (x, y), shape (n, 2), to metres along
-    the axis from its start.
+    """The calibration along a growth axis: mean `m_per_px`, its relative standard error (NaN where unknown), and the
+    map from points of the picture (x, y), shape (n, 2), to metres along the axis from its start.
     """
 
     m_per_px: float

@@ -40,9 +40,8 @@ from vinetrack.video.track import Tracking, in_metres, too_few, track_pixels
 
 @dataclass(frozen=True)
 class Measurement:
-    """A tracked recording with its scale. `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its
-    relative standard error, NaN where unknown: an error that all points share, kept apart from the random error of
-    each.
+    """A tracked recording with its scale: the mean along the growth axis, and its relative standard error, NaN where
+    unknown, which all points share, and which is kept apart from the random error of each.
     """
 
     tracking: Tracking
