@@ -24,8 +24,7 @@ from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, ca
 # ------------------------------------------------------------------------------
 # Forces, pressure and masses of a model along a known motion, effect by effect.
 #
-# The same order of physics as in the compiled kernel (`vinetrack.dynamics.simulate`), in plain Python on arrays; a test
-# compares the two.
+# The order of physics is that of the compiled kernel (`vinetrack.dynamics.simulate`), with which a test compares it.
 
 
 @dataclass(frozen=True)
@@ -80,9 +79,8 @@ def evaluate(
     state = hooks.changed("damping_gain", _with_consistent_area(hooks, state))
     tension = sum(hooks.each("tip_force", state), nothing) / rig.travel_ratio
     tail = sum(hooks.each("tail_force", state), nothing)
-    # Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
-    # counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero during growth;
-    # fold and gas remain.
+    # Everything that moves with the tail. The floor of the film's mass is that of fold and gas, which remain: mass that
+    # effects add counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero.
     added = sum(hooks.each("added_mass", state), nothing)
     with_film = np.maximum(film_mass + np.maximum(added, 0.0), rig.least_mass)
     inertia = np.asarray(np.maximum(with_film + np.minimum(added, 0.0) + rig.payload_mass, rig.least_mass))
@@ -205,9 +203,8 @@ class AuditedMotion:
         row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
         row |= {"trial": self.trial.name, "condition": self.trial.condition, "term": term, "note": ""}
         if i is not None:
-            y, length = float(self.lead_position_m[i]), self.trial.length_m
-            share = y / length if math.isfinite(length) and length > 0 else math.nan
-            row |= {"time_s": float(self.time_s[i]), "lead_position_m": y, "y_over_L": share}
+            y = float(self.lead_position_m[i])
+            row |= {"time_s": float(self.time_s[i]), "lead_position_m": y, "y_over_L": y / self.trial.length_m}
         return row | values
 
 

@@ -296,9 +296,8 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # straight line has R² = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
 #
 # Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. Each
-# size counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number.
-# Slopes are those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as
-# large if there is none.
+# size counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number. Slopes
+# are those on log axes with 95 % intervals by Student's t; p is the probability of one as large if there is none.
 
 SAME_WITHIN = 0.02  # Sizes and settings that agree within this fraction count as equal, ratios within twice it (chosen)
 

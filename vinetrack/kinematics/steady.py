@@ -418,8 +418,7 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
 #
 # As the chamber empties no speed is steady, yet the forces balance at every instant as long as inertia is a small
 # part of them. If the pressure during growth is known, measured or from the model in use, such a window gives a point
-# of the damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not
-# applied.
+# of the damping law as good as a steady one; otherwise the point would be wrong, and the rule is not applied.
 
 
 def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:

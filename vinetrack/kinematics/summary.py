@@ -221,9 +221,8 @@ def smooth(
 # ------------------------------------------------------------------------------
 # Means over replicates of each condition with standard errors: steady speed, final speed, efficiency.
 #
-# The standard error of a mean comes from the replicate scatter; for a single trial it is the error of that trial, NaN
-# where unknown. Systematic errors that all trials share (scale, yield pressure) are not included: they change all
-# conditions together.
+# The standard error of a mean comes from the replicate scatter; for a single trial it is its own, NaN where unknown.
+# Errors that all trials share (scale, yield pressure) are not included: they change all conditions together.
 
 CONDITION_COLUMNS = (
     *("condition", "vine", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g", "growth_angle_deg"),

@@ -219,8 +219,7 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
 # ------------------------------------------------------------------------------
 # A calibration target in the plane of growth, projected exactly.
 #
-# Every pixel is sampled at POINTS points, each traced through lens and tilt to the plane, where it is black or white:
-# corners are exactly where geometry puts them.
+# Corners are exactly where geometry puts them: each of POINTS points of a pixel is traced to black or white.
 
 POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
 
@@ -524,12 +523,12 @@ class SceneMotion:
         return np.asarray(np.where(np.asarray(time_s) < self._exit_s, riding, flying))
 
     def sway_px(self, time_s: float) -> float:
-        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release."""
+        """Return the displacement of the tube at `sway_length_px`, at 22 Hz, which starts smoothly at the release."""
         subject = self.scene.subject
         if not isinstance(subject, Tube) or not subject.wobble_px:
             return 0.0
         since = max(time_s - self.release_s, 0.0)
-        return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
+        return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * 22.0 * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
         """Return the shift of the picture (x, y), plane px: six sinusoids of joint rms 1, a damped kick at release."""

@@ -139,7 +139,6 @@ class Tube:
     tip_glow: float = 0.08
     reflection: float = 0.0
     wobble_px: float = 0.0
-    wobble_Hz: float = 22.0
     payload_diameter_m: float = 0.0
     payload_brightness: float = 0.06
 

@@ -25,12 +25,7 @@ from vinetrack.kinematics.damping import fit_damping
 from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
 from vinetrack.planning.prediction import gauge_left
-from vinetrack.planning.predictive_inputs import (
-    PRINTED_EXPONENT,
-    TABLE_I,
-    YIELD_PRESSURE_KPA,
-    damping_prior,
-)
+from vinetrack.planning.predictive_inputs import PRINTED_EXPONENT, TABLE_I, YIELD_PRESSURE_KPA, damping_prior
 
 # ------------------------------------------------------------------------------
 # Published numbers, beside those of Table I and the damping law; those with one use stand where they are used.

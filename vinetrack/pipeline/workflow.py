@@ -583,8 +583,7 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         "--directory", str(results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
         str(config_file), *([] if verbose else ["--quiet", "all"]),
     ]  # fmt: skip
-    # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
-    # jobs itself when the user interrupts the run.
+    # Its output is what the stages say, since it is quiet itself; when the user interrupts the run it stops its jobs.
     with (
         open(2, "w", closefd=False) if verbose else log.open("w", encoding="utf-8") as shown,
         subprocess.Popen(

@@ -44,8 +44,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
-    # 1000, -101.4: largest gauge pressure that is accepted (chosen), and least; sensors do read a little below zero
-    # (derived)
+    # 1000, -101.4: largest gauge pressure (chosen), and least (derived); sensors do read a little below zero
     wrong = np.flatnonzero((pressure_kPa > 1000.0) | (pressure_kPa < -101.4))
     if len(wrong):
         value = float(pressure_kPa[wrong[0]])
@@ -70,9 +69,8 @@ def new_track(time_s: Floats, lead_position_m: Floats, notes: Sequence[str], **k
 # ------------------------------------------------------------------------------
 # Restore times of frames that a file holds with too few digits.
 #
-# Frames 0.935 ms apart, written to the millisecond, deviate from the motion by up to half a millisecond, 2 mm at 4
-# m/s, and two of them may share the same time. Where all times of a file lie within half their last digit of an
-# evenly spaced series, that series is used.
+# Frames 0.935 ms apart, written to the millisecond, deviate by up to half a millisecond, 2 mm at 4 m/s, and two may
+# share a time. Where all times of a file lie within half their last digit of an even series, that is used.
 
 
 def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
@@ -479,8 +477,7 @@ def _stops_dead(y: Floats, noise_m: float) -> int | None:
 
 def load_track(trial: Trial) -> Track:
     """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
-    if trial.track is None:
-        raise InputError("is blank", "this trial has a video, not a track")
+    assert trial.track is not None
     chosen: dict[str, Any] = {"point_mass": trial.point_mass, "frames_used": trial.frames_used}
     track = read_track(trial.track, **chosen, capture_fps=trial.capture_fps, m_per_px=trial.m_per_px)
     return with_pressure_trace(trial, flag_end_of_motion(trial, track))

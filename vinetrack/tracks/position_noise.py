@@ -26,9 +26,8 @@ from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
 # holes. The spectra of a campaign's positions, above the frequencies of the motion itself, are compared with both kinds
 # of filter and with correlated noise by Whittle's likelihood (Whittle, J. R. Stat. Soc. B 15, 125, 1953).
 #
-# Noise averaged over N frames hardly changes from one frame to the next: an autoregressive model takes it for a random
-# walk, under which a fit can detect next to nothing. One frame in N carries the same information, and its noise is
-# independent.
+# Noise averaged over N frames hardly changes from one to the next: an autoregressive model takes it for a random walk,
+# under which a fit detects next to nothing. One frame in N carries as much, and its noise is independent.
 
 LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spectra are compared (chosen)
 
@@ -177,8 +176,7 @@ def rounding_noise(position_m: Floats) -> float:
     shortest = 12  # Points in motion below which the whole track is used (chosen)
     moving_m = position_m[_frames_at_rest(position_m) :]
     moving_m = moving_m if moving_m.size >= shortest else position_m
-    # Exact positions at one speed are multiples of their step too, but smooth: third differences are zero except a
-    # few at a corner.
+    # Exact positions at one speed are multiples of their step too, but their third differences are 0 but at corners.
     uneven = np.count_nonzero(np.abs(np.diff(moving_m, 3)) > floor_m)
     allowed = 5 if moving_m.size >= shortest else 0
     return floor_m if uneven > max(allowed, 0.05 * moving_m.size) else 0.0

@@ -243,9 +243,8 @@ def _smallest(family: str, n_markers: float) -> str:
 # = q (1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target determines these
 # ten parameters. Focal length and distance remain unknown, but are not needed to measure in the plane.
 #
-# Gaussian priors (PRIOR_SIGMA), from typical lenses and set-ups, constrain parameters that the corners do not
-# determine, so that a small target neither fails nor claims too much: the covariance of the fit includes the
-# remaining uncertainty.
+# Gaussian priors (PRIOR_SIGMA), of typical lenses and set-ups, constrain what the corners do not determine, so that a
+# small target neither fails nor claims too much: the covariance includes what remains uncertain.
 
 # Prior standard deviations of the two perspective terms, and of the two of a lens (chosen)
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)

@@ -185,8 +185,7 @@ def in_no_row(experiment: Experiment) -> list[Problem]:
 # ------------------------------------------------------------------------------
 # Facts of a recording, and whether they agree with the sheet.
 #
-# A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
-# as physics.
+# A ruler wrong by a factor of ten, a diameter for a length or a playback rate would otherwise come out as physics.
 
 ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
 
@@ -258,8 +257,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width):.3g}"
     growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth):.3g}"
     remedy = "check it, its unit and the scale, or write compare_sizes: no where only part of the tube is seen"
-    # 0.2, 0.1: difference from 1 of a ratio that may be of swapped sizes, and of the logarithms of two factors that
-    # are the same (chosen)
+    # 0.2, 0.1: difference from 1 of a ratio of swapped sizes, and between logarithms of equal factors (chosen)
     if width_off and max(abs(facts.tube_width_mm / length_mm - 1), abs(facts.growth_mm / diameter_mm - 1)) < 0.2:
         remedy = "diameter_mm and length_mm are swapped"
     elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
