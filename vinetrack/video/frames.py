@@ -66,7 +66,7 @@ def film_shots(
             stream = container.streams.video[0]
             marks = stream.codec_context.name not in NON_MARKING_DECODERS
             faulty: set[int | None] = set()
-            # With one thread each message belongs to the packet that is decoded; where workers share cores it costs less.
+            # With one thread a message belongs to the packet that is decoded; where workers share cores it costs less.
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = 0 if marks and multiprocessing.parent_process() is None else 1
             if span is not None:
