@@ -434,14 +434,10 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
         page = max(pages, key=lambda p: int(p.imagewidth) * int(p.imagelength) * (2 if p.photometric == 32803 else 1))
         if page.compression == 1 and page.bitspersample == 12:
             # Two pixels in three bytes, rows beginning on whole bytes
-            with file.open("rb") as stream:
-                strips = []
-                for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-                    stream.seek(offset)
-                    strips.append(stream.read(count))
+            strips = tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
             height, width = int(page.imagelength), int(page.imagewidth)
             row = (width * 12 + 7) // 8
-            data = np.frombuffer(b"".join(strips), np.uint8)[: height * row].reshape(height, row)
+            data = np.frombuffer(b"".join(strip for strip, _ in strips), np.uint8)[: height * row].reshape(height, row)
             padded = np.pad(data, ((0, 0), (0, -row % 3)))
             raw = unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]
         else:
