@@ -39,8 +39,7 @@ from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
 from vinetrack.dynamics.audit import audit, motion_since
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import EffectError, load_effect, remember
+from vinetrack.effects import load_effect, remember
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
@@ -361,7 +360,7 @@ def _emptied(folder: Path) -> Path:
 
 def _reason(error: Exception) -> str:
     """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
-    if isinstance(error, FitError | EffectError | SimulationError):
+    if isinstance(error, UserError):
         return str(error)
     log.exception("no fit or no diagnosis could be made")
     return INTERNAL_ERROR
