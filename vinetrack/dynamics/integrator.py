@@ -442,7 +442,7 @@ def _moved_on(s, h, rates):
 
 @compiled
 def _slack_step(equations, trial, time, s, h, tip_speed, k):
-    """One step: k (5, 4), with the rates at its start in row 0, gets those at its end in row 3. End, error, tip speed."""
+    """One step: k (5, 4), with the rates at its start in row 0, gets those at its end in row 3. End, error, speed."""
     moving = tip_speed > 0
     u = _slack_rates(equations, trial, time + h / 2, _moved_on(s, h / 2, k[0]), tip_speed, moving, k[1])
     u = _slack_rates(equations, trial, time + 3 / 4 * h, _moved_on(s, 3 / 4 * h, k[1]), u, moving, k[2])
