@@ -66,7 +66,9 @@ class UserError(Exception):
 
 
 class InputError(UserError, ValueError):
-    """A file or a value that cannot be used: what is wrong, remedy, what is allowed; pydantic reports it of its key."""
+    """A file or a value that cannot be used: what is wrong (`message`, `code`), the remedy, and what is allowed. In a
+    settings model pydantic reports it as an error of its key.
+    """
 
     def __init__(self, message: str, remedy: str = "", allowed: str = "", code: str = "") -> None:
         super().__init__(f"{message}: {remedy}" if remedy else message)

@@ -126,7 +126,9 @@ PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predi
 def display_unit(
     unit: str, pressure_unit: str = "kPa", table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS
 ) -> tuple[str, float]:
-    """Display unit of an SI unit, and the factor from SI; of pressures, and what counts per pressure, by the sheet."""
+    """Return the display unit of an SI unit and the factor from SI: itself and 1.0 if it has no other. Pressures, and
+    what is counted per pressure, have the unit of the user's sheet.
+    """
     if unit not in ("Pa", "1/Pa"):
         return table.get(unit, (unit, 1.0))
     text, factor = UNITS[pressure_unit].text, convert(1.0, "Pa", pressure_unit)

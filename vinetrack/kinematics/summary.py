@@ -318,9 +318,10 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
 
 
 def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]:
-    """The payload's fraction of the moving mass, for the efficiency of the payload alone, and the work of the weight
-    over that of the gas, for 1/(1 + it) of the efficiency with both works. The weight works on tail and payload along
-    the travel of the tail x = r·y: g cosθ ∫ m dx, as in Eq. (2) of Alvarez et al. (2025). NaN without mass, or work.
+    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas: efficiency ×
+    the first is that of the payload alone, efficiency / (1 + the second) counts both works. The weight does work on
+    tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq. (2) of Alvarez et al.
+    (2025). NaN where there is no mass, or no work.
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m

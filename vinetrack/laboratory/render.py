@@ -219,7 +219,8 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
 # ------------------------------------------------------------------------------
 # A calibration target in the plane of growth, projected exactly.
 #
-# Corners are exactly where geometry puts them: each of POINTS points of a pixel is traced to black or white.
+# Every pixel is sampled at POINTS points, each traced through lens and tilt to the plane, where it is black or white:
+# corners are exactly where geometry puts them.
 
 POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
 

@@ -426,7 +426,9 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 
 
 def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
-    """Calibrate by the first grey picture, (height, width), with a readable target: more would add next to nothing."""
+    """Calibrate from the first picture in which a target can be read: more add less than the error that all corners
+    share. Shapes: pictures (height, width), grey levels.
+    """
     complaint = "it holds no picture that can be read"
     for picture in pictures:
         try:
@@ -467,7 +469,9 @@ def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checke
 
 
 def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
-    """Move (with the error of a click), drop or confirm points of a track, which are then `corrected`, not doubtful."""
+    """Move, drop or confirm points of a track. A moved point has the error of a click; a dropped one is `rejected`; a
+    confirmed one is no longer doubtful.
+    """
     if not corrections:
         return track
     edge, sigma, slow = track.edge_px.copy(), track.lead_position_sigma_m.copy(), track.lead_position_systematic_m

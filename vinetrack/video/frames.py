@@ -66,7 +66,8 @@ def film_shots(
             stream = container.streams.video[0]
             marks = stream.codec_context.name not in NON_MARKING_DECODERS
             faulty: set[int | None] = set()
-            # With one thread a message belongs to the packet that is decoded; where workers share cores it costs less.
+            # With one thread each message belongs to the packet that is decoded; and one costs less where workers share
+            # the cores. Else FFmpeg chooses how many.
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = 0 if marks and multiprocessing.parent_process() is None else 1
             if span is not None:
@@ -452,7 +453,8 @@ def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tupl
 # ------------------------------------------------------------------------------
 # Reading frames stored as the sensor gave them: 8 to 16 bits, packed or not, one frame at a time.
 #
-# High-speed cameras write such files with headers of their own (`images`).
+# High-speed cameras write such files with headers of their own (`images`). Only the current frame is held in
+# memory.
 
 # Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064
 _TABLE_STEPS = (
