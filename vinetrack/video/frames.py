@@ -354,13 +354,16 @@ def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
     luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
+    too_large = RecordingError(
+        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
+        "cut it to the growth, and to the part of the picture that shows it",
+        recording.path.name,
+    )
+    if count > most:
+        raise too_large
     for n, picture in enumerate(pictures, 1):
-        if max(n, count) > most:
-            raise RecordingError(
-                f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
-                "cut it to the growth, and to the part of the picture that shows it",
-                recording.path.name,
-            )
+        if n > most:
+            raise too_large
         if n == 1:  # untouched memory takes no space
             luma = np.empty((count, *picture.shape), picture.dtype)
         if n > len(luma):
