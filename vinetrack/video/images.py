@@ -434,7 +434,7 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
         page = max(pages, key=lambda p: int(p.imagewidth) * int(p.imagelength) * (2 if p.photometric == 32803 else 1))
         if page.compression == 1 and page.bitspersample == 12:
             # Two pixels in three bytes, rows beginning on whole bytes
-            strips = tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
+            strips: Any = tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
             height, width = int(page.imagelength), int(page.imagewidth)
             row = (width * 12 + 7) // 8
             data = np.frombuffer(b"".join(strip for strip, _ in strips), np.uint8)[: height * row].reshape(height, row)
