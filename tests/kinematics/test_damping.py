@@ -107,7 +107,7 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors():
     x_sigma, y_sigma = draw.uniform(0.02, 0.1, count), draw.uniform(0.005, 0.03, count)
     zero = np.zeros(count)
     data = damping.Points(x, y, zero, zero, zero, zero, zero, np.exp(y), vine, names)
-    n, log_B = damping.slope(y[None], np.ones((1, count)), data, x_sigma**2, y_sigma**2)
+    n, log_B = damping.slope(np.ones((1, count)), data, x_sigma**2, y_sigma**2)
     begin, weights = np.array([0.3, *np.zeros(4)]), {"weight_x": x_sigma**-2, "weight_y": y_sigma**-2}
     solved = odr_fit(lambda x, beta: beta[1 + vine] + beta[0] * x, x, y, begin, **weights, sstol=1e-14, partol=1e-14)
     assert n[0] == pytest.approx(solved.beta[0], abs=1e-4)

@@ -127,7 +127,7 @@ def test_board_printed_by_old_opencv_with_markers_in_the_other_squares():
     page = cv2.copyMakeBorder(page, 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
     target = Target(squares=(10, 6), square_m=0.020, marker_m=0.014)
     found = calibrate_pictures([page], stated(target))
-    assert found.m_per_px == pytest.approx(0.02 / 60, rel=5e-4)
+    assert found.middle.m_per_px == pytest.approx(0.02 / 60, rel=5e-4)
     assert found.n_corners == 45
 
 

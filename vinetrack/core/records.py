@@ -68,9 +68,8 @@ class Bend:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One row of the trial sheet with shared settings filled in, in SI units; NaN for blank cells. `vine` is common to
-    trials with the same diameter, thickness and length; `condition` to replicates, trials with the same nominal
-    settings.
+    """One row of the trial sheet with shared settings filled in, SI; NaN for blank cells. `vine` is common to trials of
+    one diameter, thickness and length; `condition` to replicates, with the same nominal settings.
     """
 
     name: str
@@ -202,9 +201,8 @@ def plain_track(time_s: Floats, lead_position_m: Floats, **known: Any) -> Track:
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Motion of the leading edge at the usable points of a track. All arrays have shape (n,), SI units. `window_points`
-    is the width of the smoothing window chosen at each point; `noise_m` the standard deviation of a single position and
-    `noise_correlation` its lag-one autocorrelation.
+    """Motion of the leading edge at the usable points of a track, SI, shapes (n,). `window_points` is the width of the
+    smoothing window at each; `noise_m` the standard deviation of a position, `noise_correlation` at lag one.
     """
 
     time_s: Floats

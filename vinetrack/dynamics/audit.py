@@ -24,19 +24,16 @@ from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, ca
 # ------------------------------------------------------------------------------
 # Forces, pressure and masses of a model along a known motion, effect by effect.
 #
-# The same order of physics as in the compiled kernel (`vinetrack.dynamics.simulate`), in plain Python on arrays; a test
-# compares the two.
+# The order of physics is that of the compiled kernel (`vinetrack.dynamics.simulate`), with which a test compares it.
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Everything that the model computes along a motion; arrays of the motion's shape, SI. `tip_N` are the forces at
-    the tip by effect, `tension_N` what they do to the tail, by 1/r, `total_N` that and the forces on the tail.
+    """Everything that the model computes along a motion; arrays of the motion's shape, SI. `tension_N` is what the
+    forces at the tip do to the tail, by 1/r, `total_N` that and the forces on the tail.
     """
 
     pressure_Pa: Floats
-    area_m2: Floats
-    tip_N: Mapping[str, Floats]
     tension_N: Floats
     total_N: Floats
     acceleration_m_s2: Floats
@@ -68,7 +65,7 @@ def evaluate(
         **{"bend_angle": sum(angles, nothing), "tail_tension": nothing},
     }
     state = State(**fields)
-    film = np.prod([ones, *hooks.each("film_gain", state).values()], axis=0)
+    film = np.prod([ones, *hooks.each("film_gain", state)], axis=0)
     film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
     moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
@@ -80,19 +77,15 @@ def evaluate(
     elif hooks.calls.get("chamber_rate"):
         state = state._replace(pressure=_chamber_pressure(hooks, state))
     state = hooks.changed("damping_gain", _with_consistent_area(hooks, state))
-    tip = hooks.each("tip_force", state)
-    tension = sum(tip.values(), nothing) / rig.travel_ratio
-    tail = sum(hooks.each("tail_force", state).values(), nothing)
-    # Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
-    # counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero during growth;
-    # fold and gas remain.
-    added = sum(hooks.each("added_mass", state).values(), nothing)
+    tension = sum(hooks.each("tip_force", state), nothing) / rig.travel_ratio
+    tail = sum(hooks.each("tail_force", state), nothing)
+    # Everything that moves with the tail. The floor of the film's mass is that of fold and gas, which remain: mass that
+    # effects add counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero.
+    added = sum(hooks.each("added_mass", state), nothing)
     with_film = np.maximum(film_mass + np.maximum(added, 0.0), rig.least_mass)
     inertia = np.asarray(np.maximum(with_film + np.minimum(added, 0.0) + rig.payload_mass, rig.least_mass))
     return Terms(
         pressure_Pa=np.asarray(state.pressure),
-        area_m2=np.asarray(state.area),
-        tip_N=tip,
         tension_N=tension,
         total_N=tension + tail,
         acceleration_m_s2=(tension + tail) / inertia,
@@ -111,22 +104,22 @@ class _Hooks:
         # A measured pressure includes everything that happens in the chamber.
         acts = [bool(on[i]) and not (effect.in_trace and measured) for i, effect in enumerate(model)]
         self.calls = {
-            hook: [(model.names[i], function, theta[place].tolist()) for i, function, place in calls if acts[i]]
+            hook: [(function, theta[place].tolist()) for i, function, place in calls if acts[i]]
             for hook, calls in model.hooks.items()
         }
 
     def changed(self, hook: str, state: State) -> State:
         """The state after all effects in turn, each of which changes the same field."""
-        for _, function, values in self.calls.get(hook, ()):
+        for function, values in self.calls.get(hook, ()):
             state = state._replace(**{str(HOOKS[hook]): function(state, self.rig, *values)})
         return state
 
-    def each(self, hook: str, state: State) -> dict[str, Floats]:
+    def each(self, hook: str, state: State) -> list[Floats]:
         """The value of each effect by itself."""
-        return {
-            name: np.broadcast_to(np.asarray(function(state, self.rig, *values), dtype=float), np.shape(state.time))
-            for name, function, values in self.calls.get(hook, ())
-        }
+        return [
+            np.broadcast_to(np.asarray(function(state, self.rig, *values), dtype=float), np.shape(state.time))
+            for function, values in self.calls.get(hook, ())
+        ]
 
 
 def _with_consistent_area(hooks: _Hooks, state: State) -> State:
@@ -152,7 +145,7 @@ def _chamber_pressure(hooks: _Hooks, state: State) -> Any:
     def rate(i: int, pressure: float) -> float:
         here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
         here = _with_consistent_area(hooks, here)._replace(pressure=pressure)
-        return sum(float(value) for value in hooks.each("chamber_rate", here).values())
+        return sum(map(float, hooks.each("chamber_rate", here)))
 
     pressure = np.empty(shape)
     pressure[0] = float(fields[State._fields.index("set_pressure")][0])
@@ -210,9 +203,8 @@ class AuditedMotion:
         row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
         row |= {"trial": self.trial.name, "condition": self.trial.condition, "term": term, "note": ""}
         if i is not None:
-            y, length = float(self.lead_position_m[i]), self.trial.length_m
-            share = y / length if math.isfinite(length) and length > 0 else math.nan
-            row |= {"time_s": float(self.time_s[i]), "lead_position_m": y, "y_over_L": share}
+            y = float(self.lead_position_m[i])
+            row |= {"time_s": float(self.time_s[i]), "lead_position_m": y, "y_over_L": y / self.trial.length_m}
         return row | values
 
 

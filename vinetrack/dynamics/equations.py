@@ -79,9 +79,7 @@ class Status(IntEnum):
 
 
 class Asked(IntEnum):
-    """What `ask` is asked. Numba compiles a function for every integer that it is called with, but for all members of
-    an enumeration once.
-    """
+    """What `ask` is asked. An enumeration is compiled once; for integers, numba would compile `ask` for each."""
 
     ACCELERATION = 0  #: of the tail, m/s²
     REST_ACCELERATION = 1  #: of the tail of a vine at rest, including the forces that hold it, m/s²
@@ -186,9 +184,8 @@ NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)  # For a step without a previous one: aft
 
 @inlined
 def starting_values(point, h, previous):
-    """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated. Without a
-    previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the speed at
-    the start.
+    """Starting values of the Newton iterations: the last step's collocation polynomial, extrapolated, else those of the
+    acceleration at the start. No stage speed is set below a tenth of the speed at the start.
     """
     lowest = -0.9 * point.v
     if previous.h > 0:
@@ -215,9 +212,7 @@ def _collocation_polynomial(s, stages):
 
 @inlined
 def _newton_step(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
-    """Newton step of the increments z at the stages, by Cramer's rule: (I − h A J) d = h A f − z, J the derivatives of
-    the rates f.
-    """
+    """Newton step of the increments z, by Cramer's rule: (I − hAJ) d = hAf − z, J the derivatives of the rates f."""
     m11, m12, m13 = 1 - h * A[0][0] * j1, -h * A[0][1] * j2, -h * A[0][2] * j3
     m21, m22, m23 = -h * A[1][0] * j1, 1 - h * A[1][1] * j2, -h * A[1][2] * j3
     m31, m32, m33 = -h * A[2][0] * j1, -h * A[2][1] * j2, 1 - h * A[2][2] * j3
@@ -469,9 +464,7 @@ def average_over(times, out, means, ratio, end, square):
 
 @compiled
 def _integral(times, out, ratio, end, k, low, high):
-    """Integral of the reported position, m s, over an interval in which the motion is one polynomial: Gauss–Legendre
-    quadrature with three nodes.
-    """
+    """Integral of the reported position, m s, where the motion is one polynomial: Gauss–Legendre with three nodes."""
     middle, reach = 0.5 * (low + high), 0.5 * math.sqrt(0.6) * (high - low)
     total = 0.0
     for place in range(3):

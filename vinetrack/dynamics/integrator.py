@@ -237,9 +237,7 @@ def _cut_at_breakpoint(h, point, x_limit):
 
 @inlined
 def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale):
-    """The factor on the size of the step for the next attempt: 1 if it is accepted, 0 if the vine stops within it, and
-    it is by now so short that the time is known.
-    """
+    """Factor on the step for the next attempt: 1 where it is accepted, 0 where the vine stops at a time now known."""
     h = stages.h
     if not converged:
         return 0.25
@@ -326,9 +324,8 @@ def _wait_for_drive(equations, trial, point, until):
 
 @compiled
 def _resolvable_start(equations, trial, time, until, x, chamber, delay):
-    """Time at which a drive that rises from zero at `time` starts a resolvable motion, and the chamber pressure then.
-    That is a displacement by 10⁻⁹ of the travel. Before, the drive is a difference of large forces below their rounding
-    error, and the vine is practically at rest.
+    """Time at which a drive that rises from zero at `time` has moved the vine by 10⁻⁹ of the travel, and the pressure
+    of the chamber then: before, the drive is a difference of large forces below their rounding error.
     """
     start, pressure = time, chamber
     while time + delay < until:
@@ -445,9 +442,7 @@ def _moved_on(s, h, rates):
 
 @compiled
 def _slack_step(equations, trial, time, s, h, tip_speed, k):
-    """One step: k (5, 4), the rates at its start in the first row, is completed: those at its end are in the fourth.
-    Returns the end, its error and the tip's speed.
-    """
+    """One step: k (5, 4), with the rates at its start in row 0, gets those at its end in row 3. End, error, speed."""
     moving = tip_speed > 0
     u = _slack_rates(equations, trial, time + h / 2, _moved_on(s, h / 2, k[0]), tip_speed, moving, k[1])
     u = _slack_rates(equations, trial, time + 3 / 4 * h, _moved_on(s, 3 / 4 * h, k[1]), u, moving, k[2])

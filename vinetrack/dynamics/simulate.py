@@ -320,9 +320,8 @@ def _limits(
     on: NDArray[np.bool_],
     bends: Sequence[Sequence[tuple[float, float, float]]],
 ) -> tuple[Floats, Floats]:
-    """Tail travel at the breakpoints of the forces, increasing, and at the end of growth, m; infinite if there is none.
-    Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
-    bends begin and end, and where effects declare them.
+    """Tail travel, m, at the breakpoints of the forces, increasing, (n_trials, n_breakpoints), and at the end of
+    growth, (n_trials,); infinite if there is none. Film mass at its floor, ends of bends, and effects make breakpoints.
     """
     rig = TrialInputs(*inputs.T)
     film = np.ones(len(inputs))

@@ -54,18 +54,17 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
                 fmt=style.marker, color=style.colour, mfc=style.colour if used else st.PAPER, ms=5, mew=1.1,
                 elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3,
             )  # fmt: skip
-    fits = {method: damping.get(method) or {} for method in METHOD_NAMES}
-    for method, fit in fits.items():
-        for vine, law in (fit.get("vines") or {}).items():
+    for method in METHOD_NAMES:
+        for vine, law in damping[method]["vines"].items():
             used = drawable[(drawable["vine"] == vine) & drawable["used"]]
             if len(used):
-                _draw_law(ax, fit, vine, law["B"], st.column(used, "x_ss_m_s"), styles[vine].colour, method)
+                x_ss_m_s = st.column(used, "x_ss_m_s")
+                _draw_law(ax, damping[method], vine, law["B"], x_ss_m_s, styles[vine].colour, method)
     st.plain_log_ticks(ax)
-    fit = fits["both_axes"]
-    refused = fit.get("n") is None or fit.get("refused")
-    law = "" if refused else f"One exponent for all vines: n = {with_interval(fit['n'], fit.get('n_95_total'))}"
-    ax.set_title(law or "Steady force and speed (no fit: see the report)")
-    _law_legend(fig, drawable, fits, styles)
+    fit = damping["both_axes"]
+    n = "" if fit["refused"] else f"One exponent for all vines: n = {with_interval(fit['n'], fit['n_95_total'])}"
+    ax.set_title(n or "Steady force and speed (no fit: see the report)")
+    _law_legend(fig, drawable, damping, styles)
     return fig
 
 
@@ -77,28 +76,24 @@ def _draw_law(
     x = np.exp(np.linspace(low - margin, high + margin, 60))
     force_N = B * x ** fit["n"]
     ax.plot(x, force_N, color=colour, ls=_METHOD_LINES[method], lw=1.5, zorder=2)
-    if (sigma := log_force_sigma(fit, vine, x)) is not None:
-        dof = sum(law["n_trials"] for law in fit["vines"].values()) - len(fit["vines"]) - 1
-        factor = np.exp(student_95(dof) * sigma)
-        st.band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
+    dof = sum(law["n_trials"] for law in fit["vines"].values()) - len(fit["vines"]) - 1
+    factor = np.exp(student_95(dof) * log_force_sigma(fit, vine, x))
+    st.band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
 
 
-def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.ndarray | None:
+def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.ndarray:
     """Return the standard error of ln F = ln B + n·ln x_ss along the law of one vine. With the covariance C of (ln B,
     n): var ln F = C_BB + 2·ln x_ss·C_Bn + (ln x_ss)²·C_nn. Shapes: x_ss_m_s (n_points,) → (n_points,).
     """
-    covariance = fit.get("covariance") or {"parameters": []}
-    if f"ln B {vine}" not in covariance["parameters"]:
-        return None
-    i, j = (covariance["parameters"].index(name) for name in ("n", f"ln B {vine}"))
-    cov, slope = np.asarray(covariance["matrix"], dtype=float), np.log(x_ss_m_s)
+    i, j = (fit["covariance"]["parameters"].index(name) for name in ("n", f"ln B {vine}"))
+    cov, slope = np.array(fit["covariance"]["matrix"]), np.log(x_ss_m_s)
     variance = cov[j, j] + 2 * slope * cov[i, j] + slope**2 * cov[i, i]
-    return np.sqrt(np.maximum(variance, 0.0)) if np.isfinite(variance).all() else None
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _law_legend(fig: Figure, points: pd.DataFrame, fits: dict[str, Any], styles: dict[str, st.VineStyle]) -> None:
+def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: dict[str, st.VineStyle]) -> None:
     """Vines with B and N, the first 14 of them, which with the methods fill the height of the figure."""
-    laws = fits["both_axes"].get("vines") or {}
+    laws = damping["both_axes"]["vines"]
     counts = {str(vine): int(used.sum()) for vine, used in points.groupby("vine", sort=False)["used"]}
     breaks = "\n" if len(counts) <= 6 else ", "
     handles = []
@@ -112,7 +107,7 @@ def _law_legend(fig: Figure, points: pd.DataFrame, fits: dict[str, Any], styles:
         words = f"not in the fit, N = {n_left}"
         handles.append(st.line_key(words, color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6))
     for method, name in METHOD_NAMES.items():
-        if fits[method].get("vines"):
+        if damping[method]["vines"]:
             handles.append(st.line_key(f"{name}\nand its 95 % band", color=st.INK, ls=_METHOD_LINES[method]))
     fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=0.8)
 

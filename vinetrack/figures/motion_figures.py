@@ -112,10 +112,7 @@ def _with_margin(values: np.ndarray) -> tuple[float, float]:
 
 def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[float, float]:
     """Limits that contain every speed, and its band unless that would shrink the curve below half the axes."""
-    finite = speed_m_s[np.isfinite(speed_m_s)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = min(float(finite.min()), 0.0), max(float(finite.max()), 0.0)
+    low, high = min(float(speed_m_s.min()), 0.0), max(float(speed_m_s.max()), 0.0)
     span = (high - low) or 1.0
     band_low = float(np.nanmin(speed_m_s - half_band_m_s, initial=low))
     band_high = float(np.nanmax(speed_m_s + half_band_m_s, initial=high))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.units import pressure_text
 from vinetrack.figures.style import look
@@ -23,7 +24,6 @@ from vinetrack.narrative.verdict_text import listed_names
 from vinetrack.results import Results, read_diagnosis, read_json, read_result, table_of
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
@@ -147,8 +147,6 @@ class FigureTables:
     @property
     def curves(self) -> pd.DataFrame:
         """Measured and modelled growth of all trials, at most 1000 rows (chosen) at an even stride."""
-        import pandas as pd
-
         parts = [table.assign(condition=name) for name, table in self.trajectories.items()]
         whole = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         return whole.iloc[:: -(-len(whole) // 1000) or 1]
@@ -175,9 +173,7 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
 
 
 def condition_labels(examples: Mapping[str, Trial]) -> dict[str, str]:
-    """Short labels of conditions, by name with a trial of each: diameter, pressure, payload, and where others have the
-    same what differs in their names.
-    """
+    """Labels of conditions, by name with a trial of each: sizes, pressure, payload, and what else tells them apart."""
     labels = {name: ", ".join([f"{1e3 * t.diameter_m:g} mm", *features(t)[1:]]) for name, t in examples.items()}
     same = {label: [name.split("_") for name in labels if labels[name] == label] for label in labels.values()}
     return {
@@ -244,8 +240,6 @@ class DiagnosisTables:
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
     """Return measured and predicted positions of all trials, from release and origin as in `comparison`."""
-    import pandas as pd
-
     paths = {name: results.trajectories(name) for name in dict.fromkeys(conditions["condition"]) if name}
     compared = {name: read_result(path) for name, path in paths.items() if path.exists()}
     parts = []
@@ -271,8 +265,6 @@ def rms_m(trials: pd.DataFrame, model: str) -> float:
 
 def worst_condition(trials: pd.DataFrame) -> str:
     """Return the condition with the largest RMS error of the initial model; blank without predictions."""
-    import pandas as pd
-
     parts = trials.groupby("condition", sort=False)
     errors_m = pd.Series({str(name): rms_m(part, "model_before_m") for name, part in parts}, dtype=float).dropna()
     return str(errors_m.idxmax()) if len(errors_m) else ""
@@ -280,8 +272,6 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
     """The mean misfit of every condition in the sections of its growth, with its error, for the figure `where`."""
-    import pandas as pd
-
     if located.empty:
         return pd.DataFrame()
     counts = trials[trials["time_s"] >= 0].groupby("condition")["trial"].nunique()

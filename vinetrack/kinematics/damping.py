@@ -14,16 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import stdtr, stdtrit
 
 from vinetrack.core.records import Floats
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
@@ -53,9 +50,7 @@ class Points:
 
 
 def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Fit the law to the steady windows by both methods, and exactly as published. Returns `log_log`, `both_axes`,
-    `paper`, each as `fit_damping` describes.
-    """
+    """Fit the law to the steady windows by both methods, and exactly as published (`log_log`, `both_axes`, `paper`)."""
     fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
@@ -63,9 +58,8 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
 
 
 def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
-    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`. At a pressure where
-    a vine barely reaches a steady speed within its length, only the slower trials are steady. Their B is larger than
-    average, which would bias the upper end of the fit.
+    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`: where a vine barely
+    gets steady within its length, only the slower trials do, whose larger B would bias the upper end of the fit.
     """
     eligible = points[points["eligible"]]
     share = eligible.groupby("condition", sort=False)["used"].mean()
@@ -130,8 +124,6 @@ def _refusal(reason: str, left_out: dict[str, str]) -> dict[str, Any]:
 
 
 def _logarithms(points: pd.DataFrame) -> Points:
-    import pandas as pd
-
     sigmas = ["x_ss_sigma_m_s", "force_sigma_N", "yield_force_sigma_N", "scale_rel_sigma"]
     numbers = points.reindex(columns=["x_ss_m_s", "force_N", *sigmas]).to_numpy(float).T
     speed, force, speed_sigma, force_sigma, yield_sigma, scale_sigma = np.nan_to_num(numbers)
@@ -144,11 +136,9 @@ def _logarithms(points: pd.DataFrame) -> Points:
     )  # fmt: skip
 
 
-def slope(
-    log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
-) -> tuple[Floats, Floats]:
+def slope(counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats) -> tuple[Floats, Floats]:
     """York's slope n, (n_resamples,), with one intercept ln B for each vine, for many resamples at once. Shapes:
-    log_force, counts (n_resamples, n_points); speed_variance, force_variance (n_points,).
+    counts (n_resamples, n_points); speed_variance, force_variance (n_points,).
     """
     member = data.member
     n = np.full(counts.shape[0], 0.4)
@@ -160,9 +150,9 @@ def slope(
             weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
             total = weight @ member
             mean_x = (weight * data.log_speed) @ member / total
-            mean_y = (weight * log_force) @ member / total
+            mean_y = (weight * data.log_force) @ member / total
             dx = np.where(drawn, data.log_speed - mean_x[:, data.vine], 0.0)
-            dy = np.where(drawn, log_force - mean_y[:, data.vine], 0.0)
+            dy = np.where(drawn, data.log_force - mean_y[:, data.vine], 0.0)
             lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / multiplicity
             update = np.sum(lever * dy, axis=1) / np.sum(lever * dx, axis=1)
             has_converged = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
@@ -178,13 +168,13 @@ def _fit(
     n_points, n_vines = data.log_force.size, len(data.names)
     dof = n_points - n_vines - 1
     speed_variance, force_variance = _variances(data, dof, both_axes)
-    everything = np.ones((1, n_points))
-    exponents, log_B = slope(data.log_force[None], everything, data, speed_variance, force_variance)
+    ones = np.ones(n_points)
+    exponents, log_B = slope(ones[None], data, speed_variance, force_variance)
     n, log_B = float(exponents[0]), log_B[0]
     if not (math.isfinite(n) and n > 0):
         return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
     residual = data.log_force - log_B[data.vine] - n * data.log_speed
-    scatter = math.sqrt(float(residual @ residual) / dof) if dof > 0 else math.nan
+    scatter = math.sqrt(float(residual @ residual) / dof)
     # Covariance of n and ln B, from the curvature of χ² at its minimum
     design = np.column_stack([data.log_speed, data.member])
     variance = force_variance + n**2 * speed_variance if both_axes else np.full(n_points, scatter**2)
@@ -194,7 +184,7 @@ def _fit(
     moved = covariance @ (design.T / variance) @ shared
     estimate = np.concatenate([[n], log_B])
     # 10: fewest points for bootstrap intervals (chosen)
-    if n_points >= 10 and dof > 0:
+    if n_points >= 10:
         interval = "resampling whole trials"
         draws = _resample(data, speed_variance, force_variance, resamples, seed)
         # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter
@@ -210,8 +200,7 @@ def _fit(
         low, high = estimate - half_width, estimate + half_width
     if not both_axes:
         # N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F
-        ones = np.ones_like(data.log_force)
-        steep, steep_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
+        steep, steep_B = slope(ones[None], data, ones, 1e-14 * ones)
         shift = np.concatenate([steep, steep_B[0]]) - estimate
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
     by_shared = 1.959964 * np.sqrt(np.sum(moved**2, axis=1))
@@ -253,18 +242,19 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
 
     def scatter_of(residual: Floats, stated: Floats) -> float:
         """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
-        squares, ends = residual**2, (1e-12, float(residual @ residual) / max(dof, 1) + 1e-12)
-        low, high = (float(np.sum(squares / (stated + s))) - max(dof, 1) for s in ends)
-        if not low > 0 > high:
-            return ends[0]
-        return float(brentq(lambda s: float(np.sum(squares / (stated + s))) - max(dof, 1), *ends))
+        squares, ends = residual**2, (1e-12, float(residual @ residual) / dof + 1e-12)
+
+        def excess(s: float) -> float:
+            return float(np.sum(squares / (stated + s))) - dof
+
+        return float(brentq(excess, *ends)) if excess(ends[0]) > 0 > excess(ends[1]) else ends[0]
 
     ones = np.ones((1, data.log_force.size))
     force_variance = data.force_error**2
     scatter, n = 1e-3, np.array([0.4])
     for _ in range(60):
         speed_variance = data.speed_error**2 + (data.set_error**2 + scatter) / n[0] ** 2
-        n, log_B = slope(data.log_force[None], ones, data, speed_variance, force_variance)
+        n, log_B = slope(ones, data, speed_variance, force_variance)
         if not (math.isfinite(n[0]) and n[0] > 0):
             break
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
@@ -283,7 +273,7 @@ def _resample(data: Points, speed_variance: Floats, force_variance: Floats, resa
     for i in range(len(data.names)):
         rows = np.flatnonzero(data.vine == i)
         counts[:, rows] = random.multinomial(rows.size, np.full(rows.size, 1 / rows.size), size=resamples)
-    n, log_B = slope(data.log_force[None], counts, data, speed_variance, force_variance)
+    n, log_B = slope(counts, data, speed_variance, force_variance)
     draws = np.column_stack([n, log_B])
     return draws[np.isfinite(draws).all(axis=1) & (n > 0)]
 
@@ -306,9 +296,8 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # straight line has R² = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
 #
 # Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. Each
-# size counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number.
-# Slopes are those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as
-# large if there is none.
+# size counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number. Slopes
+# are those on log axes with 95 % intervals by Student's t; p is the probability of one as large if there is none.
 
 SAME_WITHIN = 0.02  # Sizes and settings that agree within this fraction count as equal, ratios within twice it (chosen)
 
@@ -318,8 +307,6 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`, `sizes`, `B`, `power` and
     `line` (see `regress`), and `refused` (None, or why there is no regression).
     """
-    import pandas as pd
-
     vines = damping["both_axes"]["vines"]
     table = pd.DataFrame(
         [{"vine": name, **law} for name, law in vines.items()],
@@ -360,9 +347,7 @@ def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
-    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Shapes: x,
-    y (n,).
-    """
+    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p of the slope. Shapes (n,)."""
     (intercept, slope), (intercept_95, slope_95), (_, p), r_squared = _least_squares([x], y)
     line = {"slope": slope, "slope_95": slope_95, "intercept": intercept, "intercept_95": intercept_95}
     return line | {"R2": r_squared, "p": p, "n": int(x.size)}
@@ -381,10 +366,9 @@ def _least_squares(columns: Iterable[Floats], y: Floats) -> tuple[list[float], l
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
-    """Find families of conditions that differ only in size, and the trends of speed and efficiency with size. Returns
-    `steady_speed`: scaled copies without payload at one pressure, each family with `sizes` (mm), `x_ss_m_s`,
-    `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second in
-    `over_diameter`), `monotonic`, and `refused`.
+    """Find families of conditions that differ only in size, with the trends of speed and efficiency. `steady_speed` are
+    scaled copies without payload at one pressure, with `sizes` (mm), `x_ss_m_s`, `x_ss_over_diameter_1_s`, their
+    errors, `power` and `line` of both (see `regress`), `monotonic`, and `refused`.
     """
     return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
 
@@ -461,8 +445,6 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     refused = None
     if n == 0:
         refused = "no condition has such a value above 0"
-    elif not varying:
-        refused = "all vines are of one size"
     elif dof < 1:
         refused = f"{n} conditions are too few for powers of {words} with errors: it takes {len(varying) + 2}"
     elif np.linalg.matrix_rank(matrix) < matrix.shape[1]:

@@ -31,9 +31,8 @@ from vinetrack.tracks.position_noise import ar1_sd, rest_points
 
 @dataclass(frozen=True)
 class Release:
-    """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves.
-    `moving_from_start` marks tracks without rest, whose zeros are extrapolated or those of the first point; `reason`
-    says which.
+    """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves. A track
+    `moving_from_start` has no rest: `reason` says whether its zeros are extrapolated or those of its first point.
     """
 
     time_s: float
@@ -45,9 +44,7 @@ class Release:
 
 @dataclass(frozen=True)
 class Window:
-    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady.
-    Speeds are those of the tail.
-    """
+    """A window tested by one rule; speeds of the tail. `doubtful`: the user's choice, though not shown steady."""
 
     rule: str
     accepted: bool
@@ -322,9 +319,8 @@ def _before_the_end(track: Track, position_m: Floats, first: int, last: int, len
 def _longest_steady(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, latest: int, drift_limit: float
 ) -> tuple[tuple[int, int] | None, str]:
-    """First and last point of the longest steady window up to `latest`, or the reason why there is none; of several
-    the one whose speed changes least. Windows shrink by half a per cent of the motion at a time. Shapes: time_s,
-    position_m (n,), the moving points.
+    """First and last point of the longest steady window up to `latest`, or why there is none; of several the one whose
+    speed changes least. Windows shrink by half a per cent of the motion at a time. Shapes: moving points, (n,).
     """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
@@ -422,14 +418,11 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
 #
 # As the chamber empties no speed is steady, yet the forces balance at every instant as long as inertia is a small
 # part of them. If the pressure during growth is known, measured or from the model in use, such a window gives a point
-# of the damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not
-# applied.
+# of the damping law as good as a steady one; otherwise the point would be wrong, and the rule is not applied.
 
 
 def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
-    """Find the longest window after the highest speed in which inertia is a small part of the force. Shapes:
-    pressure_Pa (n,).
-    """
+    """Find the longest window after the highest speed with little inertia in the force. Shapes: pressure_Pa (n,)."""
     parts = 3  # parts of a window in which inertia is fitted separately (chosen)
     fewest_points = 4 * parts
     trial, kinematics = motion.trial, motion.kinematics
@@ -492,9 +485,7 @@ def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
 
 @dataclass(frozen=True)
 class SteadyForce:
-    """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure,
-    which all trials of a vine share.
-    """
+    """Force in a steady window, its random error, and the error by the yield pressure, which a vine's trials share."""
 
     force_N: float
     sigma_N: float

@@ -13,10 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Indices, Kinematics, Track, Trial
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
@@ -41,10 +43,6 @@ from vinetrack.kinematics.steady import (
 from vinetrack.tracks.importers import FEWEST_POINTS
 from vinetrack.tracks.position_noise import correlated, position_noise
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 # ------------------------------------------------------------------------------
 # Velocity of the leading edge by Savitzky–Golay smoothing with a window chosen for each point.
 #
@@ -60,9 +58,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WindowFits:
-    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
-    `coefficients` (order + 1, m), their `covariance` (order + 1, order + 1, m) for noise of 1 m; `middle_s`, `half_s`
-    (m,).
+    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half, middle
+    and half (m,): `coefficients` (order + 1, m), their `covariance` (order + 1, order + 1, m) for noise of 1 m.
     """
 
     width: int
@@ -71,7 +68,6 @@ class WindowFits:
     half_s: Floats
     covariance: Floats
     misfit: Floats
-    misfit_terms: int
 
     def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
         """Evaluate the polynomials of given windows at given times. Returns position, velocity, acceleration, shape (3,
@@ -105,7 +101,7 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
-    weights, even_covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    weights, even_covariance = _scaled(_even_design(width, order), order, rho)
     covariance = np.repeat(even_covariance[0][:, :, None], m, axis=2)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
     # Odd windows contain a spacing different from the median, by more than 1 % (chosen).
@@ -115,45 +111,43 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
         u = (time_s[take] - middle[odd, None]) / half[odd, None]
-        uneven_weights, uneven_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        uneven_weights, uneven_covariance = _scaled(_solve_design(u, order), order, rho)
         results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
         covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
-    return WindowFits(width, results[: order + 1], middle, half, covariance, misfit, terms)
+    return WindowFits(width, results[: order + 1], middle, half, covariance, misfit)
 
 
-def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
+def _scaled(weights: Floats, order: int, rho: float) -> tuple[Floats, Floats]:
     """Weights with the misfits scaled to unit variance, and the covariance of the coefficients, under AR(1) noise."""
     coefficients, extra = weights[:, : order + 1], weights[:, order + 1 :]
     covariance = correlated(coefficients, rho) @ coefficients.transpose(0, 2, 1)
     spread = np.sqrt(np.sum(correlated(extra, rho) * extra, axis=2, keepdims=True))
-    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
+    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance
 
 
 @lru_cache(maxsize=64)
-def _even_design(width: int, order: int) -> tuple[Floats, int]:
+def _even_design(width: int, order: int) -> Floats:
     """The design shared by all evenly spaced windows of a width."""
     return _solve_design(np.linspace(-1, 1, width)[None, :], order)
 
 
-def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
-    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
+def _solve_design(u: Floats, order: int) -> Floats:
+    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w)."""
     # 4: orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
     terms = min(4, u.shape[1] - order - 1)
     q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
     q = q.transpose(0, 2, 1)
     inside = q[:, : order + 1]
     coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
-    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
+    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1)
 
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
-    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track, two or more,
-    whose times increase.
-    """
+    """Estimate the motion of the leading edge at the usable points of a track, two or more, whose times increase."""
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
     noise_m, rho = position_noise(time_s, position_m)
@@ -184,9 +178,9 @@ def smooth(
     least = min(n, max(WINDOWS[0], order + 2))
     widths = [least, *(width for width in WINDOWS if least < width <= n)]
     fits = [fit_all_windows(time_s, position_m, width, min(order, width - 1), rho) for width in widths]
-    # Largest misfit of a window that fits its points, by number of terms (derived)
+    # Largest misfit of a window that fits its points, by the points that it has beyond its coefficients (derived)
     limits = (np.inf, 12.0, 15.3, 18.0, 20.5)
-    fits_points = [fit.misfit <= noise_m**2 * limits[fit.misfit_terms] for fit in fits]
+    fits_points = [fit.misfit <= noise_m**2 * limits[min(fit.width - len(fit.coefficients), 4)] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
     # Range of velocities on which the centred windows agree, from the narrowest up, and the least error; unbounded
     # where not even the narrowest window fits its points: then one-sided windows decide.
@@ -227,9 +221,8 @@ def smooth(
 # ------------------------------------------------------------------------------
 # Means over replicates of each condition with standard errors: steady speed, final speed, efficiency.
 #
-# The standard error of a mean comes from the replicate scatter; for a single trial it is the error of that trial, NaN
-# where unknown. Systematic errors that all trials share (scale, yield pressure) are not included: they change all
-# conditions together.
+# The standard error of a mean comes from the replicate scatter; for a single trial it is its own, NaN where unknown.
+# Errors that all trials share (scale, yield pressure) are not included: they change all conditions together.
 
 CONDITION_COLUMNS = (
     *("condition", "vine", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g", "growth_angle_deg"),
@@ -244,8 +237,6 @@ def condition_table(
     trials: pd.DataFrame, known: Sequence[Trial], *, final_at_fraction: float, efficiency_at_mm: float
 ) -> pd.DataFrame:
     """Return a row for each condition, columns `CONDITION_COLUMNS`, in the order of the sheet."""
-    import pandas as pd
-
     measured = trials[trials["status"].isin(["ok", "warning"])]
     first = {trial.condition: trial for trial in reversed(known)}
     tables = {name: group.set_index("trial") for name, group in measured.groupby("condition", sort=False)}
@@ -307,9 +298,7 @@ def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float
 
 
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
-    """Return the velocity with which the leading edge first passes a position, interpolated linearly in position.
-    Shapes: lead_position_m, lead_velocity_m_s (n,).
-    """
+    """Lead velocity where the edge first passes a position, linear between points; NaN if it does not. Shapes (n,)."""
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
         return math.nan
@@ -318,9 +307,8 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 
 
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
-    """Return the ratio of kinetic energy to work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth. m(x) is
-    the moving mass of tail and payload, ẋ = r·ẏ. NaN where there is no work. Source: Alvarez et al. (2025), section
-    IV-D, with the moving mass of their Eq. (1).
+    """Kinetic energy over the work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth, with the moving mass
+    of tail and payload, ẋ = r·ẏ; NaN without work. Source: Alvarez et al. (2025), section IV-D, and their Eq. (1).
     """
     work_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     if not work_J > 0:
@@ -346,15 +334,9 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]
     return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
 
 
-class TrialError(ValueError):
-    """A trial that cannot be analysed; the message is a sentence for its `reason`."""
-
-
 @dataclass(frozen=True)
 class TrialResult(TrialMotion):
-    """Results of one trial under a model. `row` has the columns of `trials.csv`, `point` those of the damping fit, with
-    `used` and the `reason` if not.
-    """
+    """Results of one trial under a model: its `row` of `trials.csv`, and its `point` of the damping fit."""
 
     row: Mapping[str, object]
     point: Mapping[str, object]
@@ -373,7 +355,7 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     """Find velocity, release and the windows that do not depend on a model."""
     usable = int(track.usable.sum())
     if usable < FEWEST_POINTS:
-        raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
+        raise UserError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
     kinematics = estimate_kinematics(
         track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
     )
@@ -405,10 +387,7 @@ def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
     """Compute velocity, steady windows by every rule, force, final speed and efficiency of one trial."""
     motion = look_at_motion(trial, track, settings)
-    try:
-        steady = steadiness_under(motion, model)
-    except EffectError as error:
-        raise TrialError(str(error)) from error
+    steady = steadiness_under(motion, model)
     track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.window
     moved_m = track.lead_position_m[track.usable]
     # Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there
@@ -492,33 +471,25 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings)
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
     motions = []
     for trial, track in pairs:
-        with suppress(TrialError):
+        with suppress(UserError):
             motions.append(look_at_motion(trial, track, settings))
     return motions
 
 
 def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings) -> Mapping[str, Any]:
-    """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
-    cannot be analysed under the model are left out.
-    """
-    import pandas as pd
-
-    rows, reasons = [], []
+    """The damping law, as in `damping.json`, with the pressure of a model, of all trials it can be computed for."""
+    rows = []
     for motion in motions:
-        try:
+        with suppress(EffectError):
             rows.append(damping_point(motion.trial, steadiness_under(motion, model)))
-        except EffectError as error:
-            reasons.append(str(error))
     if not rows:
-        raise ValueError(f"no trial can be analysed under this model: {'; '.join(reasons) or 'there is none'}")
+        raise ValueError("no trial can be analysed under this model")
     points = mark_half_steady(pd.DataFrame(rows))
     return fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
 
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """Return laws under several models as one table: a row for each model, method and vine; SI."""
-    import pandas as pd
-
     rows = [
         (name, method, vine, law["n"], *law["n_95_total"], vine_law["B"], *vine_law["B_95_total"], vine_law["n_trials"])
         for name, methods in laws.items()

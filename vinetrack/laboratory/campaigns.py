@@ -42,9 +42,8 @@ from vinetrack.video.track import track_recording
 
 @dataclass(frozen=True, kw_only=True)
 class GroundTruth:
-    """Ground truth of a simulated campaign. `effects` and `values` are the physics. Scatter is a relative between-trial
-    standard deviation of B or P; `yield_error_kPa` is the standard deviation of the error of the stated yield
-    pressures.
+    """Ground truth of a simulated campaign. `effects` and `values` are the physics. Scatter of B and P is relative,
+    between trials; `yield_error_kPa` is the standard deviation of the error of stated yield pressures.
     """
 
     effects: Sequence[str] = BASE_EFFECTS
@@ -73,9 +72,8 @@ def read_ground_truth(path: Path) -> GroundTruth:
 
 @dataclass(frozen=True)
 class VirtualTrial:
-    """One simulated trial and its measurement. `stated` is the trial as the sheet states it, `true` as it was, `model`
-    the true model with this trial's B. `track` is what the analysis gets; its zeros are arbitrary. The rest is the
-    truth, SI; `release_s` is on the track's clock.
+    """One simulated trial as the sheet has it (`stated`) and as it was (`true`), its true `model` with its own B;
+    `track` is what is analysed, with arbitrary zeros, the rest the truth, SI, with `release_s` on the track's clock.
     """
 
     stated: Trial
@@ -215,10 +213,7 @@ def render_recording(
     renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
     camera, encoding, depth = scene.camera, scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
-    of_grey = {8: "gray", 12: "gray12le", 16: "gray16le"}
-    pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else of_grey.get(depth)
-    if pixel_format is None:
-        raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
+    pixel_format = "yuv420p" if is_h264 else {8: "gray", 12: "gray12le", 16: "gray16le"}[depth]
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
     # The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene
     height, width = (camera.height_px + 1) // 2, (camera.width_px + 1) // 2
@@ -254,9 +249,8 @@ def render_recording(
 
 
 def render_target(target: Target, scene: Scene, *, seed: int = 0) -> Frame:
-    """Render one picture of a target through the camera of a scene, blurred by its optics, with its noise. The truth is
-    `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by
-    a quarter across the picture. Shape (height, width).
+    """One picture, (height, width), of a target through the camera of a scene, with its blur and noise; the light rises
+    by a quarter across. `scene.camera.plane_from_picture`, times `m_per_px`, says where in the plane a pixel looks.
     """
     bare, camera = replace(scene.backdrop, launcher=False, ruler=False, clutter=False), scene.camera
     scene = replace(scene, backdrop=bare, door=None)

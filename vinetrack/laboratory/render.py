@@ -524,12 +524,12 @@ class SceneMotion:
         return np.asarray(np.where(np.asarray(time_s) < self._exit_s, riding, flying))
 
     def sway_px(self, time_s: float) -> float:
-        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release."""
+        """Return the displacement of the tube at `sway_length_px`, at 22 Hz, which starts smoothly at the release."""
         subject = self.scene.subject
         if not isinstance(subject, Tube) or not subject.wobble_px:
             return 0.0
         since = max(time_s - self.release_s, 0.0)
-        return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
+        return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * 22.0 * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
         """Return the shift of the picture (x, y), plane px: six sinusoids of joint rms 1, a damped kick at release."""
@@ -550,8 +550,7 @@ class SceneMotion:
     def door_angle_rad(self, time_s: float) -> float:
         """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop."""
         door = self.scene.door
-        if door is None or not math.isfinite(self.release_s):
-            return 0.0
+        assert door is not None
         opened = (time_s - self.release_s + door.lead_s) / door.swing_s
         if opened <= 0:
             return 0.0
@@ -726,11 +725,6 @@ class FrameRenderer:
     ) -> None:  # fmt: skip
         self.scene, self._seed = scene, seed
         self.exposure_s = scene.exposure_fraction / capture_fps if exposure_s is None else exposure_s
-        if not 0 < self.exposure_s <= 1 / capture_fps:
-            raise ValueError(
-                f"An exposure of {self.exposure_s * 1e6:.0f} µs does not fit between frames at {capture_fps:g} a "
-                "second; choose a shorter one."
-            )
         self._motion = SceneMotion(
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )

@@ -139,7 +139,6 @@ class Tube:
     tip_glow: float = 0.08
     reflection: float = 0.0
     wobble_px: float = 0.0
-    wobble_Hz: float = 22.0
     payload_diameter_m: float = 0.0
     payload_brightness: float = 0.06
 
@@ -288,6 +287,4 @@ def preset(name: str) -> Scene:
         "falling_ball": ball,
         "dark_ball": replace(ball, subject=Ball(brightness=0.06, texture=0.2, specular=0.8), backdrop=dark_wall),
     }
-    if name not in scenes:
-        raise ValueError(f"No scene is called {name!r}; choose one of {', '.join(scenes)}.")
     return scenes[name]

@@ -343,9 +343,7 @@ Outcome = TypeVar("Outcome")
 
 
 class Job(Generic[Progress, Outcome]):
-    """Work in a thread, which calls `on_progress` with every step, and `on_end` with the outcome or else with None and
-    the reason, through `soon` where another thread is to do that.
-    """
+    """Work in a thread: `on_progress` gets its steps, `on_end` its outcome, or None and the reason, through `soon`."""
 
     def __init__(
         self,

@@ -487,9 +487,8 @@ def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[st
 
 
 def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
-    """Return the cells of a trial sheet given by the names of recordings. Only numbers with a letter or a unit are
-    read: a bare number counts replicates. A quantity that all names give in the same other unit keeps it
-    (`pressure_psi`); a mixture of units is converted to that of the sheet.
+    """The cells of a trial sheet by the names of recordings. Only numbers with a letter or a unit are read: a bare one
+    counts replicates. A unit that all names give a quantity is kept; a mixture is converted to that of the sheet.
     """
     found = [_cells_of_name(recording) for recording in recordings]
     columns: dict[str, str] = {}

@@ -416,9 +416,7 @@ class Page:
     # ---- drawing -------------------------------------------------------------------------------------------------
 
     def _soon(self, work: Callable[[], None], delay_ms: int = 4) -> None:
-        """Do it once after a delay, however often it is asked for until then: by default a quarter of a screen's frame,
-        so that several moves of a slider cause one redraw.
-        """
+        """Do it once after a delay, by default a quarter of a screen's frame, however often it is asked for."""
         if work in self._pending:
             return
 

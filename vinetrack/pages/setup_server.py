@@ -98,9 +98,7 @@ def axis_json(axis: Axis) -> dict[str, Any]:
 
 
 def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
-    """Track the recording of one row, which may be incomplete: strip, edge and notes. Without a scale positions are in
-    pixels, without a rate times are in frames, see `scaled` and `timed`.
-    """
+    """Track the recording of one row, in pixels without a scale, in frames without a rate: see `scaled` and `timed`."""
     settings = read_experiment_settings(folder / SETTINGS)
     table = in_sheet_units(read_table(folder / SHEET), SHEET)[0]
     trial = make_trial(read_row(table, index, settings), folder, settings)
@@ -458,7 +456,7 @@ class _Answer(_Quiet):
             self.set_status(HTTPStatus.OK)
         except ExperimentError as error:
             content = {"problems": [_problem_json(problem) for problem in error.problems], "words": str(error)}
-        except (UserError, RecordingError) as error:
+        except UserError as error:
             content = {"words": str(error)}
         except (KeyError, ValueError, TypeError, OSError) as error:
             log.exception("%s", self.request.path)

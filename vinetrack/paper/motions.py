@@ -21,16 +21,11 @@ from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
-from vinetrack.kinematics.damping import fit_laws
+from vinetrack.kinematics.damping import fit_damping
 from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
 from vinetrack.planning.prediction import gauge_left
-from vinetrack.planning.predictive_inputs import (
-    PRINTED_EXPONENT,
-    TABLE_I,
-    YIELD_PRESSURE_KPA,
-    damping_prior,
-)
+from vinetrack.planning.predictive_inputs import PRINTED_EXPONENT, TABLE_I, YIELD_PRESSURE_KPA, damping_prior
 
 # ------------------------------------------------------------------------------
 # Published numbers, beside those of Table I and the damping law; those with one use stand where they are used.
@@ -216,29 +211,16 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
             if scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m) == scale
         ]
         runs = simulate_many(departure.model(vine.B), of_scale, [time_s] * len(of_scale))
-        rows += [_point(scale, trial, moved) for trial, moved in zip(of_scale, runs, strict=True)]
-    law = fit_laws(pd.DataFrame(rows), resamples=100)["paper"]
+        for trial, moved in zip(of_scale, runs, strict=True):
+            growing = moved.time_s < np.nan_to_num(moved.end_time_s, nan=np.inf)
+            track = plain_track(moved.time_s[growing], moved.lead_position_m[growing])
+            window = paper_window(track, travel_ratio=trial.travel_ratio)
+            if window.accepted:
+                size = 1e3 * trial.diameter_m, 1e6 * trial.thickness_m
+                rows.append((str(scale), *size, window.x_ss_m_s, paper_force_N(trial)))
+    points = pd.DataFrame(rows, columns=["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N"])
+    law = fit_damping(points, resamples=100)["log_log"]
     return float(law["n"]), {int(vine): float(vine_law["B"]) for vine, vine_law in law["vines"].items()}
-
-
-def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
-    """A row of the damping fit that only the published rule uses, from a motion without noise."""
-    stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
-    track = plain_track(moved.time_s[:stop], moved.lead_position_m[:stop])
-    window = paper_window(track, travel_ratio=trial.travel_ratio)
-    unknown = dict.fromkeys(("x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N"), math.nan)
-    return {
-        "trial": trial.name,
-        "vine": str(scale),
-        "diameter_mm": 1e3 * trial.diameter_m,
-        "thickness_um": 1e6 * trial.thickness_m,
-        **unknown,
-        "yield_force_sigma_N": 0.0,
-        "x_ss_paper_m_s": window.x_ss_m_s if window.accepted else math.nan,
-        "force_paper_N": paper_force_N(trial),
-        "eligible": True,
-        "used": False,
-    }
 
 
 # ------------------------------------------------------------------------------

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
-from vinetrack.core.problems import INTERNAL_ERROR, InputError, confirmed, remark
+from vinetrack.core.problems import INTERNAL_ERROR, InputError, UserError, confirmed, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
@@ -38,8 +39,7 @@ from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
 from vinetrack.dynamics.audit import audit, motion_since
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import EffectError, load_effect, remember
+from vinetrack.effects import load_effect, remember
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
@@ -50,7 +50,6 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_half_steady, mark_left_out
 from vinetrack.kinematics.summary import (
-    TrialError,
     TrialMotion,
     TrialResult,
     condition_table,
@@ -61,7 +60,7 @@ from vinetrack.kinematics.summary import (
 )
 from vinetrack.narrative.diagnosis_text import damping_headline, failures_told, proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
-from vinetrack.pipeline.workflow import Job, Kept, map_unordered
+from vinetrack.pipeline.workflow import Job, Kept, Say, map_unordered
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results import (
     KINEMATICS_COLUMNS,
@@ -84,7 +83,6 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -127,7 +125,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             track, columns, view = _of_recording(trial, measurement, experiment)
             summary = summarise_trial(trial, track, settings, model_of(experiment))
-    except (RecordingError, InputError, TrialError) as error:
+    except UserError as error:
         from_file = trial.track if trial is not None and trial.video is None and isinstance(error, InputError) else None
         reason = f"{from_file.name} {error}" if from_file else str(error)
     except Exception as error:
@@ -184,8 +182,6 @@ def _bare_row(name: str, status: str, reason: str, trial: Trial | None = None) -
 
 def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any]) -> dict[str, Any]:
     """Write the tables of a trial, without results headers only; return what it adds to those of the experiment."""
-    import pandas as pd
-
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
     if summary is None:
         track, kinematics = table_of(TRACK_COLUMNS), table_of(KINEMATICS_COLUMNS)
@@ -263,9 +259,7 @@ def fit_damping(job: Job) -> list[str]:
 
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Gather the results of all trials in `trials.csv`, `conditions.csv` and `steady.csv`. Returns the first of these,
-    and the points of the damping law.
-    """
+    """Gather all trials in `trials.csv`, `conditions.csv`, `steady.csv`; return the first, and points of the law."""
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     if experiment.settings.axis is None:
@@ -366,7 +360,7 @@ def _emptied(folder: Path) -> Path:
 
 def _reason(error: Exception) -> str:
     """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
-    if isinstance(error, FitError | EffectError | SimulationError):
+    if isinstance(error, UserError):
         return str(error)
     log.exception("no fit or no diagnosis could be made")
     return INTERNAL_ERROR
@@ -375,11 +369,9 @@ def _reason(error: Exception) -> str:
 # ------------------------------------------------------------------------------
 # Diagnosis of a results folder: which effects the model lacks, and how much they reduce its errors.
 
-Report = Callable[[str], None]
-
 
 def diagnosed(
-    experiment: Experiment, results: Results, pairs: Pairs, report: Report, fitted: Fit | None = None
+    experiment: Experiment, results: Results, pairs: Pairs, report: Say, fitted: Fit | None = None
 ) -> Diagnosis:
     """The diagnosis of these trials as the experiment asks for it, with what contradicts its sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
@@ -450,8 +442,6 @@ def all_steps(results: Results, ladder: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder below the steps by which earlier runs came to its first model: those of their ladder above it,
     if its error there is the same, so that it is of the same trials.
     """
-    import pandas as pd
-
     former = next((read_result(path) for path in (results.kept_steps, results.ladder) if path.exists()), ladder[:0])
     known = zip(former["model"], former["rms_in_sample_m"].astype(float), strict=True)
     for k, (model, rms_m) in enumerate(known if len(ladder) else ()):
@@ -475,12 +465,9 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
 
 
 def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
-    """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
-    origin are fitted per trial. Returns each trial under the initial model, and a table: s and m, `model_after_m` NaN
-    if no effect was added.
+    """Predict every trial with the initial and the final model; as in `comparison.csv`, only release and origin are
+    fitted per trial. Returns each trial under the first, and a table, s and m, `model_after_m` NaN if none was added.
     """
-    import pandas as pd
-
     final = {} if after is before else {one.name: one.predicted_position_m for one in _followed(after)}
     found = []
     for one in _followed(before):
@@ -499,7 +486,7 @@ def _followed(fit: Fit) -> Sequence[TrialFit]:
         return ()
 
 
-def propose_effect(experiment: Experiment, folder: Path, report: Report) -> tuple[list[str], list[Path]]:
+def propose_effect(experiment: Experiment, folder: Path, report: Say) -> tuple[list[str], list[Path]]:
     """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
     results = Results(folder)
     diagnosis = read_diagnosis(results)

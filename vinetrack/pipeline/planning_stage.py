@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import vinetrack.results as layout
 from vinetrack.core.problems import ExperimentError, InputError, Problem, Remark, format_problems, remark
@@ -124,8 +125,6 @@ def predict_conditions(
     *, samples: int, seed: int, at_fraction: float, figure: Path | None = None, csv: Path | None = None, **given: Any
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """Predict all conditions, see `read_basis`; write figure and curves if requested. Returns lines, JSON content."""
-    import pandas as pd
-
     planned, stated, fit, heading = read_basis(**given)
     all_inputs = progress([predictive_inputs(trial, stated, fit) for trial in planned.trials], "predicting")
     predictions = [vines.predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
@@ -350,9 +349,8 @@ def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PowerRequest:
-    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
-    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
-    with each.
+    """Options of the command, NaN and None where not given; standard deviations between trials are relative. `effects`
+    are names, or `name=size` in the parameter's unit; `simulate` campaigns are simulated with each.
     """
 
     target: Path

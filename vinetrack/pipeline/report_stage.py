@@ -28,7 +28,7 @@ from vinetrack.figures.style import render
 from vinetrack.paper import rows as paper
 from vinetrack.pipeline.workflow import SHARED_FILES, Job, input_files, map_unordered
 from vinetrack.report.build import build_report, recording_facts, report_content, tally, write_overlay, write_recording
-from vinetrack.video.frames import RecordingError, inspect_recording
+from vinetrack.video.frames import inspect_recording
 from vinetrack.video.survey import measure_recording
 
 log = logging.getLogger(__name__)
@@ -169,26 +169,23 @@ def track_file(
         settings = ExperimentSettings(calibration=read_experiment_settings(file).calibration)
         if settings.calibration is None:
             raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
-    try:
-        recording = inspect_recording(path)
-        rate = capture_fps if recording.capture_fps is None else recording.capture_fps
-        if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
-            raise UserError(str(remark("other_rate_in_file", file=path.name, given=capture_fps, stated=rate)))
-        trial = Trial(
-            name=path.stem,
-            video=recording.path,
-            capture_fps=rate if math.isfinite(rate) else 1.0,
-            capture_fps_is_playback=True,
-            exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
-            # Without a scale, the unit of length is one pixel.
-            m_per_px=mm_per_px / 1e3 if scaled else 1.0,
-            travel_ratio=1.0 if body else 2.0,
-            axis=axis,
-            frames_used=frames_used,
-        )
-        measured = measure_recording(trial, settings, file.parent if calibration else Path())
-    except RecordingError as error:
-        raise UserError(str(error)) from None
+    recording = inspect_recording(path)
+    rate = capture_fps if recording.capture_fps is None else recording.capture_fps
+    if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
+        raise UserError(str(remark("other_rate_in_file", file=path.name, given=capture_fps, stated=rate)))
+    trial = Trial(
+        name=path.stem,
+        video=recording.path,
+        capture_fps=rate if math.isfinite(rate) else 1.0,
+        capture_fps_is_playback=True,
+        exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
+        # Without a scale, the unit of length is one pixel.
+        m_per_px=mm_per_px / 1e3 if scaled else 1.0,
+        travel_ratio=1.0 if body else 2.0,
+        axis=axis,
+        frames_used=frames_used,
+    )
+    measured = measure_recording(trial, settings, file.parent if calibration else Path())
     if not math.isfinite(rate):
         track = measured.tracking.track
         untimed = replace(track, time_s=np.full(len(track.time_s), math.nan))

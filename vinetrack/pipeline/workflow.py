@@ -66,9 +66,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: what it does in words, and by which function, `module:name`, of a job. `settings` are the keys of a
-    run that it depends on; `reads` and `writes` are files of the results, or groups of files that the plan of a run
-    knows, in `<…>`.
+    """One stage: what it does in words, and by which function, `module:name`, of a job; the keys of a run's settings
+    that it depends on; what it `reads` and `writes`: files of the results, or groups that the plan knows, in `<…>`.
     """
 
     does: str
@@ -160,9 +159,8 @@ def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_w
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
-    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
-    memory.
+    """End this worker when its parent process ends, even if that is killed. A worker waits for its next argument on a
+    pipe that the others hold open too: all of them would wait for ever and keep their memory.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -313,9 +311,8 @@ TRIALS_PER_JOB = 100  # Largest number of trials of one job (chosen: as recordin
 
 @dataclass(frozen=True)
 class WorkflowPlan:
-    """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
-    gets empty ones); `measurements` are files that the virtual laboratory makes, and `state` is that of all files that
-    people brought.
+    """Inputs and outputs of one run: `trials` that get files (empty ones for a faulty row), `measurements` that the
+    virtual laboratory makes, and the `state` of all files that people brought.
     """
 
     experiment: Path
@@ -329,9 +326,8 @@ class WorkflowPlan:
     @cached_property
     def version_file(self) -> str:
         """A file of the results that changes with the package, with any input, and where a trial lacks other files than
-        its last, which reruns everything; what a stage need not make again is kept. Snakemake need not watch inputs
-        itself, whose names it may take for patterns, and parameters of rules would not do: it compares them only with
-        what it ran from the same folder.
+        its last; it reruns everything, but what is kept. Snakemake need not watch inputs, whose names it may take for
+        patterns, and parameters of rules would not do: it compares them only with what it ran from the same folder.
         """
         path, version = self.results / "logs" / "version", f"{code_hash()} {self.state}"
         figures = (f"figures/trial_{{}}.{form}" for form in self.settings.figures.formats)
@@ -587,8 +583,7 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         "--directory", str(results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
         str(config_file), *([] if verbose else ["--quiet", "all"]),
     ]  # fmt: skip
-    # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
-    # jobs itself when the user interrupts the run.
+    # Its output is what the stages say, since it is quiet itself; when the user interrupts the run it stops its jobs.
     with (
         open(2, "w", closefd=False) if verbose else log.open("w", encoding="utf-8") as shown,
         subprocess.Popen(

@@ -146,9 +146,7 @@ def _frames_are(frames: int) -> str:
 
 
 def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> tuple[int, int, bool] | None:
-    """The first fault on a row beyond `after`: that row, by how many frames the times from there on are early, and
-    whether it repeats the row before.
-    """
+    """The first fault beyond a row: its row, how many frames early times are from there on, whether it is a copy."""
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
@@ -207,9 +205,8 @@ def _fault_at(frame: Floats, y: Floats, i: int, noise_m: float, rho: float) -> t
 
 
 def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float) -> _Jump | None:
-    """Jump of position between two sides of a smooth motion. The widest sides that follow one parabola are used. None
-    where there are no such sides, where either moves slowly compared with the noise, or where their speeds differ so
-    much that a jump cannot be told from acceleration.
+    """Jump of position between two sides of a smooth motion, the widest that follow one parabola. None without such
+    sides, and where either is slow beside the noise, or so much faster that the jump may be acceleration.
     """
     for points in SIDE_POINTS:
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
@@ -266,9 +263,7 @@ def mean_speed(track: Track) -> float:
 
 
 def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
-    """Say which tracks are longer than their vine, whose tip cannot run farther, as a payload can that leaves it; blank
-    where none is, or not surely.
-    """
+    """Say which tracks are longer than their vine, beyond which no bare tip can run; blank where none is for sure."""
     travels: list[tuple[Trial, float]] = []
     for trial, track in pairs:
         position_m = track.lead_position_m[track.usable]

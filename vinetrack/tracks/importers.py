@@ -13,7 +13,8 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -23,10 +24,6 @@ from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flag
 from vinetrack.core.tables import Table, parse_table, read_bytes, read_table, read_text
 from vinetrack.core.units import UNITS, number, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise, turning_point
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
 
 # ------------------------------------------------------------------------------
 # Checks that every imported track must pass, and how a track is assembled.
@@ -47,8 +44,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
-    # 1000, -101.4: largest gauge pressure that is accepted (chosen), and least; sensors do read a little below zero
-    # (derived)
+    # 1000, -101.4: largest gauge pressure (chosen), and least (derived); sensors do read a little below zero
     wrong = np.flatnonzero((pressure_kPa > 1000.0) | (pressure_kPa < -101.4))
     if len(wrong):
         value = float(pressure_kPa[wrong[0]])
@@ -73,9 +69,8 @@ def new_track(time_s: Floats, lead_position_m: Floats, notes: Sequence[str], **k
 # ------------------------------------------------------------------------------
 # Restore times of frames that a file holds with too few digits.
 #
-# Frames 0.935 ms apart, written to the millisecond, deviate from the motion by up to half a millisecond, 2 mm at 4
-# m/s, and two of them may share the same time. Where all times of a file lie within half their last digit of an
-# evenly spaced series, that series is used.
+# Frames 0.935 ms apart, written to the millisecond, deviate by up to half a millisecond, 2 mm at 4 m/s, and two may
+# share a time. Where all times of a file lie within half their last digit of an even series, that is used.
 
 
 def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
@@ -164,8 +159,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
     `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
     """
-    from xml.etree import ElementTree
-
     # Documents that define entities are refused: they can expand without end.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
@@ -209,7 +202,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     return new_track(time_s, position_m, [*notes, note], edge_px=edge_px)
 
 
-def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
+def _frame_values(node: ElementTree.Element, *names: str) -> dict[int, tuple[float, ...]]:
     """Numbers stored per frame under `framedata`; frames that lack one are left out."""
     values: dict[int, tuple[float, ...]] = {}
     for entry in node.findall("property[@name='framedata']/property"):
@@ -223,7 +216,7 @@ def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
+def _axes(panel: ElementTree.Element) -> dict[int, tuple[float, ...]]:
     """The coordinate systems by the frame from which they are valid: origin in px, angle in degrees, px per unit."""
     coords = _object(panel, "coords")
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
@@ -235,7 +228,7 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _clock(panel: Element) -> tuple[float, float, int]:
+def _clock(panel: ElementTree.Element) -> tuple[float, float, int]:
     """Seconds per frame, and time and number of the start frame."""
     clip, control = _object(panel, "videoclip"), _object(panel, "clipcontrol")
     video = None if clip is None else _object(clip, "video")
@@ -249,17 +242,17 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     return frame_ms / 1000, start_ms / 1000, int(start_frame)
 
 
-def _object(node: Element, name: str) -> Element | None:
+def _object(node: ElementTree.Element, name: str) -> ElementTree.Element | None:
     """The object stored in a property."""
     return node.find(f"property[@name='{name}']/object")
 
 
-def _text(node: Element, name: str) -> str:
+def _text(node: ElementTree.Element, name: str) -> str:
     """The text of a property, blank where there is none."""
     return node.findtext(f"property[@name='{name}']") or ""
 
 
-def _number(node: Element, name: str) -> float:
+def _number(node: ElementTree.Element, name: str) -> float:
     """A stored number; NaN where it is missing, is none or is beyond LARGEST_NUMBER."""
     try:
         value = float(_text(node, name) or "nan")
@@ -484,8 +477,7 @@ def _stops_dead(y: Floats, noise_m: float) -> int | None:
 
 def load_track(trial: Trial) -> Track:
     """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
-    if trial.track is None:
-        raise InputError("is blank", "this trial has a video, not a track")
+    assert trial.track is not None
     chosen: dict[str, Any] = {"point_mass": trial.point_mass, "frames_used": trial.frames_used}
     track = read_track(trial.track, **chosen, capture_fps=trial.capture_fps, m_per_px=trial.m_per_px)
     return with_pressure_trace(trial, flag_end_of_motion(trial, track))
@@ -540,9 +532,7 @@ def track_lines(tracks: Iterable[tuple[Trial, Track]]) -> list[str]:
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
-    """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels. Returns times in s
-    and gauge pressures in Pa, two arrays, shape (n,).
-    """
+    """Times, s, and gauge pressures, Pa, (n,) each: a CSV with `time_s, pressure_kPa`, or a TDMS with such channels."""
     if path.suffix.lower() == ".tdms":
         time_s, pressure_Pa = _tdms_trace(path)
         lines: Sequence[int] = range(1, len(time_s) + 1)
@@ -562,9 +552,8 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
 
 
 def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
-    """Interpolate a pressure trace linearly on the times of a track; trace and track share one clock. Beyond the ends
-    of the trace its first and last values are held, which a note reports. Shapes: time_s, pressure_Pa (n,) →
-    (n_frames,).
+    """Interpolate a pressure trace linearly on the times of a track, which share one clock. Beyond the ends of the
+    trace its first and last values are held, which a note reports. Shapes: time_s, pressure_Pa (n,).
     """
     start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
     if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):

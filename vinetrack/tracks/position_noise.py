@@ -26,9 +26,8 @@ from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
 # holes. The spectra of a campaign's positions, above the frequencies of the motion itself, are compared with both kinds
 # of filter and with correlated noise by Whittle's likelihood (Whittle, J. R. Stat. Soc. B 15, 125, 1953).
 #
-# Noise averaged over N frames hardly changes from one frame to the next: an autoregressive model takes it for a random
-# walk, under which a fit can detect next to nothing. One frame in N carries the same information, and its noise is
-# independent.
+# Noise averaged over N frames hardly changes from one to the next: an autoregressive model takes it for a random walk,
+# under which a fit detects next to nothing. One frame in N carries as much, and its noise is independent.
 
 LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spectra are compared (chosen)
 
@@ -134,11 +133,10 @@ THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences
 
 
 def position_noise(time_s: Floats, position_m: Floats, *, robust: bool = False) -> tuple[float, float]:
-    """Estimate the standard deviation and lag-one correlation of the random error of single positions. `robust`: so
-    that a fault in a short track does not pass for noise, at most 1.84 times what the median third difference says,
-    which a single fault hardly changes; of positions that are rounded, and mostly at rest, it carries no information.
-    Returns noise_m (0 where the positions are exact or fewer than 5), correlation (0 to 0.95; shrunk to 0 where the
-    track is short). Shapes: time_s, position_m (n,).
+    """Standard deviation (0 where positions are exact, or fewer than 5) and lag-one correlation (0 to 0.95, shrunk to 0
+    in short tracks) of the random error of single positions. `robust`: so that a fault in a short track is no noise, at
+    most 1.84 times what the median third difference says, which a single fault hardly changes; it says nothing of
+    positions that are rounded, and mostly at rest. Shapes: time_s, position_m (n,).
     """
     if position_m.size < 5:
         return 0.0, 0.0
@@ -178,8 +176,7 @@ def rounding_noise(position_m: Floats) -> float:
     shortest = 12  # Points in motion below which the whole track is used (chosen)
     moving_m = position_m[_frames_at_rest(position_m) :]
     moving_m = moving_m if moving_m.size >= shortest else position_m
-    # Exact positions at one speed are multiples of their step too, but smooth: third differences are zero except a
-    # few at a corner.
+    # Exact positions at one speed are multiples of their step too, but their third differences are 0 but at corners.
     uneven = np.count_nonzero(np.abs(np.diff(moving_m, 3)) > floor_m)
     allowed = 5 if moving_m.size >= shortest else 0
     return floor_m if uneven > max(allowed, 0.05 * moving_m.size) else 0.0
@@ -234,9 +231,8 @@ def rough_noise(position_m: Floats) -> float:
 
 
 def rest_points(position_m: Floats) -> int:
-    """Count the points at the start that are at rest; 0 where the track starts in motion. The track leaves rest where
-    it rises above the resting level for good; the corner is then that of the best flat-then-straight line through the
-    points up to there. Shapes: position_m (n,).
+    """Count the points at rest at the start; 0 where the track starts in motion. It leaves rest where it rises above
+    the resting level for good, at the corner of the best flat-then-straight line up to there. Shapes: position_m (n,).
     """
     n = position_m.size
     if n < 5:
@@ -262,9 +258,7 @@ def rest_points(position_m: Floats) -> int:
 
 
 def turning_point(position: Floats, back: Floats | float) -> int | None:
-    """Furthest point of a motion that turns back, behind which two points in a row then lie by more than `back`; None
-    where there is none. Shapes: position (n,).
-    """
+    """Furthest point before two in a row lie farther than `back` behind it; None if there are none. Shapes (n,)."""
     is_back = np.maximum.accumulate(position) - position > back
     turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     return int(np.argmax(position[: turned[0] + 1])) if turned.size else None
@@ -388,9 +382,7 @@ class LocalFit:
 
 
 def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
-    """Compare every point with a robust cubic through its twelve nearest neighbours. Shapes: time_s, position_m
-    (n_points,).
-    """
+    """Compare every point with a robust cubic through its twelve neighbours. Shapes: time_s, position_m (n_points,)."""
     n = time_s.size
     begin = np.clip(np.arange(n) - HALF_WIDTH, 0, n - FEWEST_POINTS)
     places = begin[:, None] + np.arange(FEWEST_POINTS)
@@ -441,9 +433,8 @@ def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
 
 
 def find_outliers(time_s: Floats, position_m: Floats) -> Bools:
-    """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
-    if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
-    (n_points,).
+    """Mark the points far off the motion around them: the largest deviations first, others only if they remain without
+    those, since an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) → (n_points,).
     """
     from scipy.special import stdtrit  # scipy.stats takes most of a second to load
 
@@ -531,9 +522,7 @@ FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Standard deviations `sd_m` of every point, one array, shape (n_points,), for each trial. `blur_s` is τ, 0 where
-    the standard deviations follow those stated.
-    """
+    """Standard deviations of each trial's points, (n_points,); `blur_s` is τ, or 0 where they follow those stated."""
 
     sd_m: tuple[Floats, ...]
     blur_s: float
@@ -541,9 +530,7 @@ class NoiseShape:
 
 @dataclass(frozen=True)
 class _Differences:
-    """Fourth differences of a trial, scaled to the noise of one position, m; which are used; speeds, m/s. All arrays
-    have shape (n_points,).
-    """
+    """Fourth differences of a trial, m, scaled to the noise of a position; which are used; speeds, all (n_points,)."""
 
     distance_m: Floats
     use: np.ndarray
@@ -553,9 +540,7 @@ class _Differences:
 def noise_shape(
     time_s: Sequence[Floats], position_m: Sequence[Floats], stated_m: Sequence[Floats | None]
 ) -> NoiseShape | None:
-    """Find how the noise of an experiment's tracks varies; None where equal noise describes them as well. Shapes:
-    time_s, position_m (n_points,).
-    """
+    """Find how the noise of tracks varies; None where equal noise describes them as well. Shapes (n_points,) each."""
     if not time_s or min(times.size for times in time_s) < FEWEST_POINTS:
         return None
     differences = [_differences(t, y) for t, y in zip(time_s, position_m, strict=True)]

@@ -13,9 +13,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,8 +55,6 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     """Find the corners of a ChArUco board in the picture (px) and on the board (m), both of shape (n, 2). Boards
     printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
     """
-    import cv2
-
     grey, dictionary = eight_bits(picture), _dictionary(board.dictionary)
     corners, ids = _detect_markers(grey, dictionary)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
@@ -77,11 +77,7 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
-    """Find the inner corners of a checkerboard in the picture (px), all of which must be there, and on the board (m),
-    both of shape (n, 2).
-    """
-    import cv2
-
+    """Find all inner corners of a checkerboard in the picture (px) and on the board (m), both of shape (n, 2)."""
     grey, (across, down) = eight_bits(picture), board.squares
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for columns, rows in dict.fromkeys([(across, down), (down, across)]):
@@ -109,11 +105,7 @@ def _not_as_stated(picture: NDArray[Any], found: str) -> CalibrationError:
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
-    """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is
-    none.
-    """
-    import cv2
-
+    """Count the squares across and down of a checkerboard, as far as visible; None where there is none."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     if not seen:
@@ -126,8 +118,6 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
 
 def _dictionary(name: str) -> Any:
     """A dictionary of markers by its name in OpenCV."""
-    import cv2
-
     code = getattr(cv2.aruco, name, None)
     if code is None:
         raise CalibrationError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
@@ -140,8 +130,6 @@ def _best_layout(
     """Share of the markers that lie where a board has them, their size (mm) beside squares of `square_mm`, and its
     layout: as OpenCV prints it from version 4.6, or as before.
     """
-    import cv2
-
     found = []
     for legacy in (False, True):
         layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
@@ -156,8 +144,6 @@ def _detect_markers(
     """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1), from the picture or a larger copy,
     for squares that are only a few pixels wide. Pixel 0 of a copy is centred on ½/enlarge − ½ of the picture's.
     """
-    import cv2
-
     copy = cv2.resize(grey, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(copy)
     if ids is None:
@@ -169,8 +155,6 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
     """Share of markers where the board has them, and their size (mm) when squares are `square_mm`. The centres of the
     markers fix the plane whatever their size; sizes are then measured in that plane.
     """
-    import cv2
-
     places = {
         int(key): np.array(square)[:, :2] for key, square in zip(layout.getIds(), layout.getObjPoints(), strict=True)
     }
@@ -193,9 +177,7 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
 
 
 def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floats]:
-    """Corners and their places on the board to a micrometre, both of shape (n, 2), unless they are too few or on one
-    line.
-    """
+    """Corners, and their places on the board to a micrometre, (n, 2) each, unless they are too few or on one line."""
     if len(grid_m) >= FEWEST_CORNERS:
         grid_m = 1e-6 * np.rint(1e6 * grid_m)
         if min(len(np.unique(grid_m[:, k])) for k in (0, 1)) > 1:
@@ -261,9 +243,8 @@ def _smallest(family: str, n_markers: float) -> str:
 # = q (1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target determines these
 # ten parameters. Focal length and distance remain unknown, but are not needed to measure in the plane.
 #
-# Gaussian priors (PRIOR_SIGMA), from typical lenses and set-ups, constrain parameters that the corners do not
-# determine, so that a small target neither fails nor claims too much: the covariance of the fit includes the
-# remaining uncertainty.
+# Gaussian priors (PRIOR_SIGMA), of typical lenses and set-ups, constrain what the corners do not determine, so that a
+# small target neither fails nor claims too much: the covariance includes what remains uncertain.
 
 # Prior standard deviations of the two perspective terms, and of the two of a lens (chosen)
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)
@@ -273,8 +254,7 @@ N_PLANE, N_LENS = 8, 2  # Parameters of a plane and of a lens (derived)
 @dataclass(frozen=True)
 class PlaneMap:
     """Map from pixels to the plane of growth. `parameters` are the first eight entries of the homography from
-    undistorted half-diagonals to metres, row by row (the ninth is 1), then κ₁ and κ₂; `covariance`, shape (10, 10), is
-    their covariance.
+    undistorted half-diagonals to metres, by rows (the ninth is 1), κ₁ and κ₂; `covariance` is theirs, (10, 10).
     """
 
     width_px: int
@@ -294,9 +274,7 @@ class PlaneMap:
         return self._plane_m(self.parameters, picture_px)
 
     def path_rel_sigma(self, places_px: Floats) -> float:
-        """Return the relative standard error of the length of a path in the plane, from the covariance. Shapes:
-        places_px (n, 2).
-        """
+        """Relative standard error of the length of a path in the plane, from the covariance; its places are (n, 2)."""
         gradient = np.zeros(self.parameters.size)
         steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
         for k, step in enumerate(steps):
@@ -309,8 +287,6 @@ class PlaneMap:
         return float(np.sqrt(max(variance, 0.0)) / length_along(self.plane_m(places_px))[-1])
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
-        import cv2
-
         until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12
         camera, lens = _camera(self.width_px, self.height_px), np.append(parameters[N_PLANE:], (0.0, 0.0))
         points = np.ascontiguousarray(picture_px, dtype=float).reshape(-1, 1, 2)
@@ -330,10 +306,7 @@ def _homography(parameters: Floats) -> Floats:
 
 
 def fit_plane(corners_px: Floats, board_m: Floats, width_px: int, height_px: int) -> tuple[PlaneMap, float]:
-    """Fit plane and lens to the corners of a board; also return the root mean square reprojection error, px. Shapes:
-    corners_px, board_m (n, 2).
-    """
-    import cv2
+    """Fit plane and lens to corners of a board, (n, 2) each; also return the rms reprojection error, px."""
     from scipy.optimize import least_squares
 
     camera, still, reach_m = _camera(width_px, height_px), np.zeros(3), float(np.ptp(board_m, axis=0).max())
@@ -369,9 +342,8 @@ CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
 
 @dataclass(frozen=True)
 class AxisScale:
-    """The calibration along one growth axis. `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative
-    standard error (NaN where unknown); `position_m` maps points of the picture (x, y), shape (n, 2), to metres along
-    the axis from its start.
+    """The calibration along a growth axis: mean `m_per_px`, its relative standard error (NaN where unknown), and the
+    map from points of the picture (x, y), shape (n, 2), to metres along the axis from its start.
     """
 
     m_per_px: float
@@ -381,10 +353,7 @@ class AxisScale:
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """The result of a calibration. `m_per_px` and `scale_rel_sigma` hold across the middle of `covered_px` (left, top,
-    right, bottom: the target's corners, or the whole picture without one), along the picture's longer side; `along`
-    gives them for a growth axis.
-    """
+    """The result of a calibration; `covered_px` is left, top, right and bottom of the target, or of the picture."""
 
     kind: str
     plane: PlaneMap
@@ -394,20 +363,16 @@ class PlaneCalibration:
     covered_px: tuple[float, float, float, float]
     notes: tuple[str, ...] = ()
 
-    @property
-    def m_per_px(self) -> float:
-        """Scale across the middle of what the target covers, m/px."""
-        return self.along(self._middle_line()).m_per_px
-
-    @property
-    def scale_rel_sigma(self) -> float:
-        """Relative standard error of `m_per_px`; NaN where unknown."""
-        return self.along(self._middle_line()).scale_rel_sigma
+    @cached_property
+    def middle(self) -> AxisScale:
+        """The scale across the middle of what the target covers, along the picture's longer side."""
+        left, top, right, bottom = self.covered_px
+        if self.plane.width_px >= self.plane.height_px:
+            return self.along(Axis((left, (top + bottom) / 2), (right, (top + bottom) / 2)))
+        return self.along(Axis(((left + right) / 2, top), ((left + right) / 2, bottom)))
 
     def along(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
-        """Return scale and position along an axis: the arc length of a curve in the plane, not of its chord, which
-        `off_px` across it changes.
-        """
+        """Scale and position along an axis: a curve's arc length in the plane, not its chord; `off_px` changes it."""
         places_px, along_px = np.array([axis.from_px, axis.to_px]), np.array([0.0, axis.length_px])
         if axis.bends:
             # 4.0: length of the chords over which a curve is summed in the plane (derived)
@@ -424,12 +389,6 @@ class PlaneCalibration:
         rel_sigma = math.hypot(self.plane.path_rel_sigma(places_px), self.own_rel_sigma)
         rel_sigma = math.hypot(rel_sigma, off_px * abs(axis.turn_rad) / axis.length_px)
         return AxisScale(float(path_m[-1]) / axis.length_px, rel_sigma, position_m)
-
-    def _middle_line(self) -> Axis:
-        left, top, right, bottom = self.covered_px
-        if self.plane.width_px >= self.plane.height_px:
-            return Axis((left, (top + bottom) / 2), (right, (top + bottom) / 2))
-        return Axis(((left + right) / 2, top), ((left + right) / 2, bottom))
 
 
 def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int) -> PlaneCalibration:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
 
@@ -55,9 +56,8 @@ class Shot(NamedTuple):
 def film_shots(
     recording: Recording, said: list[Said], span: tuple[int, int] | None = None, chosen: Container[float] | None = None
 ) -> Generator[tuple[NDArray[Any], Shot]]:
-    """Decode a film: all of it, from a tick to another, or the packets of chosen ticks alone. A frame is corrupt as the
-    decoder marks it, or as it says of the packet in `said`, to which it adds what it says. A packet that cannot be
-    decoded costs only its own frame.
+    """Decode a film: all, from a tick to another, or the packets of chosen ticks. A frame is corrupt as the decoder
+    marks it, or as it says of the packet, which is added to `said`; an undecodable packet costs only its own frame.
     """
     import av
 
@@ -101,10 +101,9 @@ def film_shots(
 
 
 def damaged_frames(shots: Sequence[Shot], slot: Indices, complained: bool) -> Bools:
-    """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,). A decoder marks only the frame in
-    which it met the fault. The frames after it are coded as differences from it and are equally wrong, without a
-    message, until the next key frame; where the decoder `complained`, so are those after lost ones. Shapes: slot
-    (n_frames,) → (n_frames,).
+    """Mark frames that are corrupt or coded from corrupt ones, shape (n_frames,). A decoder marks only the frame in
+    which it met the fault; those after it, coded as differences from it, are equally wrong, without a message, until
+    the next key frame; where it `complained`, so are those after lost ones. Shapes: slot (n_frames,).
     """
     damaged = np.array([shot.corrupt for shot in shots], dtype=bool)
     after_lost = complained & (np.diff(slot, prepend=slot[0]) > 1)
@@ -116,9 +115,7 @@ def damaged_frames(shots: Sequence[Shot], slot: Indices, complained: bool) -> Bo
 
 
 class PacketIndex(NamedTuple):
-    """All frames of a film in display order: their times in ticks, and whether each is a key frame. Shapes
-    (n_frames,).
-    """
+    """All frames of a film in display order: time in ticks, and whether it is a key frame. Shapes (n_frames,)."""
 
     ticks: NDArray[np.int64]
     key: Bools
@@ -219,7 +216,7 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     return odd
 
 
-class RecordingError(ValueError):
+class RecordingError(UserError, ValueError):
     """A recording that cannot be used: whose it is, what is wrong and what to do; together they are one sentence."""
 
     def __init__(self, message: str, remedy: str = "", name: str = "") -> None:
@@ -353,9 +350,7 @@ def shots_of(
 
 
 def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int) -> NDArray[Any]:
-    """Write pictures straight into one array, for `count` of them or longer where more come, unless they do not fit in
-    memory.
-    """
+    """Write pictures straight into one array, for `count` of them, longer if more come, unless memory is too small."""
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     most = int(min(memory_for_pictures() / (recording.height * recording.width * pixel_bytes), 2**31))
     luma, n = np.empty((0, recording.height, recording.width), np.uint8), 0
@@ -434,10 +429,9 @@ def _inspect_container(path: Path) -> Recording:
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[Indices, str]:
-    """Return the capture period of every frame since the first from its timestamp, both (n_frames,), and a note on
-    irregularities ("" if there are none). Timestamps are rounded to whole multiples of their median spacing, so that a
-    missing frame leaves a gap. Those that repeat, run backwards or fit no common period are not used; frames are then
-    numbered consecutively.
+    """Capture period of every frame since the first from its timestamp, both (n_frames,), and a note on irregularities,
+    if any. Timestamps are rounded to multiples of their median spacing, so that a missing frame leaves a gap; where
+    they repeat, run backwards or fit no common period, frames are numbered consecutively.
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):
@@ -486,9 +480,8 @@ PHANTOM_TABLE[: len(_TABLE_STEPS) + 1] = 2 + np.cumsum([0, *map(int, _TABLE_STEP
 
 @dataclass(frozen=True)
 class RawFrames:
-    """Location of the frames in a file, and packing of their pixels. `offsets` are the positions of the first byte of
-    each frame. `stored_bits` is the number of bits of a pixel in the file: 8, 16 (least significant byte first), or
-    packed 10 or 12 (most significant bits first).
+    """Location of the frames in a file (`offsets` of their first bytes), and packing of their pixels: `stored_bits` is
+    8, 16 (least significant byte first), or packed 10 or 12 (most significant bits first).
     """
 
     file: Path
@@ -544,9 +537,7 @@ def unpack_pixels(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
 
 
 def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
-    """Return the brightness of a sensor with a colour filter array, for any 2 by 2 pattern: a [1 2 1] kernel both ways.
-    Shapes: mosaic (height, width).
-    """
+    """Brightness of a sensor with any 2 by 2 colour mosaic: a [1 2 1] kernel both ways. Shape (height, width)."""
     import cv2
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -217,9 +218,7 @@ def inspect_mraw(path: Path) -> Recording:
 
 
 def read_side_file(path: Path) -> tuple[Recording, str, str]:
-    """Read a Photron `.cih` or `.cihx`: what it states of the recording, the format of its pictures and their colours.
-    `raw` has no frames yet.
-    """
+    """What a Photron `.cih` or `.cihx` states of a recording, still without frames; format, colours of its pictures."""
     name = path.name
     try:
         file_size(path)  # refuses a pipe, on which reading would wait
@@ -312,8 +311,6 @@ CAMERA_READERS = {".cine": inspect_cine} | dict.fromkeys((".mraw", *SIDE_FILES),
 
 def inspect_images(path: Path) -> Recording:
     """Read the facts of a folder of images or a TIFF stack from its first picture."""
-    import cv2
-
     is_stack = not path.is_dir()
     files, numbers, notes = ((path,), (), ()) if is_stack else _numbered_files(path)
     if is_stack and path.stat().st_size == 0:
@@ -335,9 +332,7 @@ def inspect_images(path: Path) -> Recording:
 def picture_shots(
     recording: Recording, said: list[Said], part: tuple[int, int] | None = None
 ) -> Generator[tuple[NDArray[Any], Shot]]:
-    """Each picture, of a camera's own file from a frame to another. One that cannot be read is black, and `said` so; a
-    stack ends before it.
-    """
+    """Each picture, or part of a camera's file; an unreadable one is black and `said` so; a stack ends before it."""
     if (raw := recording.raw) is not None:
         first, last = part or (0, len(raw.offsets) - 1)
         pictures = replace(raw, offsets=raw.offsets[first : last + 1]).pictures()
@@ -387,8 +382,6 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
 
 def _read_or_none(file: Path) -> NDArray[Any] | None:
     """One picture as brightness, uint8 or uint16; None where it cannot be read."""
-    import cv2
-
     try:
         if file.stat().st_size == 0:
             return None
@@ -404,8 +397,6 @@ def _read_or_none(file: Path) -> NDArray[Any] | None:
 
 def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
     """Pages of a TIFF stack in order, up to the first that cannot be read."""
-    import cv2
-
     count = recording.declared_frames or 0
     for start in range(0, count, 64):
         ok, pages = cv2.imreadmulti(str(recording.path), start, min(64, count - start), flags=cv2.IMREAD_ANYDEPTH)
@@ -443,14 +434,10 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
         page = max(pages, key=lambda p: int(p.imagewidth) * int(p.imagelength) * (2 if p.photometric == 32803 else 1))
         if page.compression == 1 and page.bitspersample == 12:
             # Two pixels in three bytes, rows beginning on whole bytes
-            with file.open("rb") as stream:
-                strips = []
-                for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-                    stream.seek(offset)
-                    strips.append(stream.read(count))
+            strips: Any = tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
             height, width = int(page.imagelength), int(page.imagewidth)
             row = (width * 12 + 7) // 8
-            data = np.frombuffer(b"".join(strips), np.uint8)[: height * row].reshape(height, row)
+            data = np.frombuffer(b"".join(strip for strip, _ in strips), np.uint8)[: height * row].reshape(height, row)
             padded = np.pad(data, ((0, 0), (0, -row % 3)))
             raw = unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]
         else:

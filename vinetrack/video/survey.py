@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from vinetrack.core.process import progress, table
 from vinetrack.core.records import CONTAINERS, IMAGES, SIDE_FILES, Trial
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.units import number
-from vinetrack.experiment.folder import SETTINGS, SHEET
+from vinetrack.experiment.folder import SETTINGS, SHEET, Experiment
 from vinetrack.experiment.settings import Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.tracks.importers import FEWEST_POINTS
@@ -34,19 +34,14 @@ from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.track import Tracking, in_metres, too_few, track_pixels
 
-if TYPE_CHECKING:
-    from vinetrack.experiment.folder import Experiment
-
-
 # ------------------------------------------------------------------------------
 # Measure a recording: its track in metres by the experiment's calibration, and the error of the scale.
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A tracked recording with its scale. `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its
-    relative standard error, NaN where unknown: an error that all points share, kept apart from the random error of
-    each.
+    """A tracked recording with its scale: the mean along the growth axis, and its relative standard error, NaN where
+    unknown, which all points share, and which is kept apart from the random error of each.
     """
 
     tracking: Tracking
@@ -79,7 +74,7 @@ def measure_recording(
             calibration = _calibrated(settings.calibration, folder, recording.width, recording.height)
         except CalibrationError as error:
             raise RecordingError(error.what, error.remedy, "calibration") from error
-    m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
+    m_per_px = trial.m_per_px if calibration is None else calibration.middle.m_per_px
     axis = given_axis(trial, settings, m_per_px)
     diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
     exposure_s = capture_exposure(trial, recording)
@@ -190,8 +185,7 @@ def in_no_row(experiment: Experiment) -> list[Problem]:
 # ------------------------------------------------------------------------------
 # Facts of a recording, and whether they agree with the sheet.
 #
-# A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
-# as physics.
+# A ruler wrong by a factor of ten, a diameter for a length or a playback rate would otherwise come out as physics.
 
 ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
 
@@ -263,8 +257,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width):.3g}"
     growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth):.3g}"
     remedy = "check it, its unit and the scale, or write compare_sizes: no where only part of the tube is seen"
-    # 0.2, 0.1: difference from 1 of a ratio that may be of swapped sizes, and of the logarithms of two factors that
-    # are the same (chosen)
+    # 0.2, 0.1: difference from 1 of a ratio of swapped sizes, and between logarithms of equal factors (chosen)
     if width_off and max(abs(facts.tube_width_mm / length_mm - 1), abs(facts.growth_mm / diameter_mm - 1)) < 0.2:
         remedy = "diameter_mm and length_mm are swapped"
     elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
@@ -277,9 +270,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """Report a stated exposure that the blur of the moving edge contradicts: a warning, or an error where it is twice
-    as much as is allowed.
-    """
+    """A stated exposure that the blur of the moving edge contradicts: a warning, at twice what is allowed an error."""
     allowed_px = 3.0  # Difference of the blur lengths of stated and seen exposure (measured)
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
@@ -336,9 +327,7 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
 
 
 class Surveyor:
-    """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
-    trials whose recordings were tracked.
-    """
+    """Opens the recordings of an experiment: the `facts` of each by trial, and the trials `looked_into` by tracking."""
 
     def __init__(self, keep: Keep | None = None) -> None:
         self.keep = keep
@@ -365,7 +354,7 @@ class Surveyor:
             of_trial, m_per_px, rel_sigma = [], trial.m_per_px, math.nan
             scale = calibrations.get((opened[trial].width, opened[trial].height))
             if not math.isfinite(m_per_px) and scale is not None:
-                m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
+                m_per_px, rel_sigma = scale.middle.m_per_px, scale.middle.scale_rel_sigma
             axis = given_axis(trial, experiment.settings, m_per_px)
             facts = _stated_facts(trial, opened[trial], m_per_px, rel_sigma, axis)
             if trial in self.looked_into:
@@ -472,7 +461,7 @@ def _scale_problems(
     of_all = False  # whether the axis that all share was named, for the first picture that it does not fit
     for trial, recording in opened.items():
         scale = calibrations.get((recording.width, recording.height))
-        m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
+        m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.middle.m_per_px
         axis = given_axis(trial, settings, m_per_px)
         half_px = trial.diameter_m / m_per_px / 2 if axis is None or math.isnan(axis.width_px) else axis.width_px / 2
         if axis and (complaint := axis_problem(axis, half_px, (recording.width, recording.height))):
