@@ -180,8 +180,8 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
         if abs(one.change) >= 0.005
     ]
     if changes:
-        head = ("not in the model", "at its usual size", "final speed at the medians", "")
-        yield from ("", *table(changes, head, align="<<<>"))
+        left_out = ("not in the model", "at its usual size", "final speed at the medians", "")
+        yield from ("", *table(changes, left_out, align="<<<>"))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 

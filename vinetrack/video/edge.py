@@ -480,7 +480,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
     last, first = (np.sort(strip.brightness(frames), axis=0)[END_FRAMES // 2] for frames in ends)
-    changed, by_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness([-1])[0]))
+    changed, by_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness(ends[0])[-1]))
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
