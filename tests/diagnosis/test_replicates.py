@@ -11,7 +11,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis import diagnose as diagnosing
 from vinetrack.diagnosis.diagnose import diagnose, implied_pressure_Pa, odd_trials
 from vinetrack.diagnosis.ladder import compare, position_errors, replicates_of
-from vinetrack.diagnosis.result import Diagnosis, Round
+from vinetrack.diagnosis.result import Candidate, Diagnosis, Round
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
@@ -159,9 +159,17 @@ def test_usual_trials_are_rarely_odd_nor_are_many(monkeypatch):
     assert diagnosing._farthest(np.append(0.02 * draw.standard_normal(13), [0.5, 5.0, 50.0])) == []
 
 
-@pytest.mark.parametrize(("others", "odd"), [("unexplained", ()), ("adequate", ("t2",))])
-def test_a_trial_is_odd_only_where_the_others_leave_nothing_unexplained(campaign, monkeypatch, others, odd):
-    rounds = iter([(Round(verdict="unexplained"),), (Round(verdict=others),)])
+FAULT, DIFFER = ((Candidate("a", kind, in_answer_set=True),) for kind in ("measurement", "between_trials"))
+
+
+@pytest.mark.parametrize(
+    ("first", "others", "odd"),
+    [((), "unexplained", ()), ((), "adequate", ("t2",)), (FAULT, "adequate", ()), (DIFFER, "adequate", ("t2",))],
+)
+def test_a_trial_is_odd_only_where_the_others_leave_nothing_unexplained(campaign, monkeypatch, first, others, odd):
+    """Also where trials were found to differ, but beside no other fault of the measurement."""
+    verdict = "artefact" if first else "unexplained"
+    rounds = iter([(Round(verdict=verdict, ranking=first),), (Round(verdict=others),)])
     monkeypatch.setattr(diagnosing, "odd_trials", lambda _: ("t2",))
     monkeypatch.setattr(diagnosing, "_diagnosis_of", lambda fit, *_: Diagnosis(rounds=next(rounds), fits=(fit,)))
     assert diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False).odd_trials == odd

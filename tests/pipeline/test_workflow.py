@@ -21,7 +21,7 @@ from vinetrack.inference.fit_data import pairs_of
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import STAGES
 from vinetrack.results import TRIALS_COLUMNS, Results, table_of
-from vinetrack.tracks.frame_timing import longer_than_stated
+from vinetrack.tracks.frame_timing import ends_short, longer_than_stated
 
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
@@ -102,6 +102,9 @@ def test_check_names_a_copied_track_and_one_that_is_longer_than_its_vine(tmp_pat
     facts = longer_than_stated(pairs_of(tmp_path)[0]).facts
     assert (facts["count"], facts["name"], facts["length_m"]) == (1, "d", 0.25)
     assert facts["travel_m"] == pytest.approx(0.295, abs=0.005)
+    ended = [(trial, track.flagged(np.arange(150, 200), "after_end")) for trial, track in pairs_of(tmp_path)[0]]
+    assert ends_short(ended).facts["travel_m"] == pytest.approx(0.245, abs=0.01)
+    assert not ends_short(ended[:2] + ended[3:])  # two of a vine of 400 mm, one that is as long as it is
 
 
 def test_a_check_of_the_same_files_is_made_once_and_one_that_finds_an_error_each_time(tmp_path, monkeypatch):

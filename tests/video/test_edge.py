@@ -379,25 +379,6 @@ def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell():
     assert sigma[16 : last - 4].max() < 0.5
 
 
-@pytest.mark.slow
-def test_a_noisier_picture_has_a_larger_error():
-    """Every fourth picture has five times the noise, as where a coder spares bits."""
-    frames = np.arange(95.0)
-    true = grown_px(frames)
-    moves = (frames > 20) & (frames < 92)
-    noisy = moves & (frames % 4 == 0)
-    found = []
-    for seed in (342, 343, 344, 345):
-        luma = step_frames(true[:, None], seed=seed).astype(float)
-        luma[noisy] += np.random.default_rng(seed).normal(0, 10, luma[noisy].shape)
-        error, tracking, sigma, _ = step_errors(np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, true)
-        use = moves & tracking.track.usable
-        found.append(np.array([error, sigma, noisy])[:, use])
-    error, sigma, which = np.concatenate(found, axis=1)
-    for chosen, low, high in ((which == 1, 0.7, 2.0), (which == 0, 0.8, 1.25)):
-        assert low < np.sqrt(np.mean(sigma[chosen] ** 2) / np.mean(error[chosen] ** 2)) < high
-
-
 @pytest.mark.parametrize("door_grey", [30, 90])
 def test_an_edge_behind_a_sliding_door_is_lost(door_grey):
     """A striped door slides by in front of the first 80 px of growth; the tip comes out from behind it and is seen."""

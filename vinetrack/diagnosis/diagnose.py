@@ -52,7 +52,7 @@ from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
-from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing, longer_than_stated
+from vinetrack.tracks.frame_timing import correct_frames, ends_short, frames_surely_missing, longer_than_stated
 from vinetrack.tracks.position_noise import rejected_points_note
 
 
@@ -104,7 +104,9 @@ def diagnose(
 
     result = diagnosed(fit)
     last_fit = (*result.fits, *result.rounds[-1].partial_fits)[-1]
-    if result.final_verdict in (ADEQUATE, UNEXPLAINED) and (names := odd_trials(last_fit)):
+    named = [row.kind for row in result.rounds[-1].ranking if row.in_answer_set]
+    nothing_named = result.final_verdict in (ADEQUATE, UNEXPLAINED) or set(named) == {BETWEEN_TRIALS}
+    if nothing_named and (names := odd_trials(last_fit)):
         others = diagnosed(initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects))
         if others.final_verdict == ADEQUATE:
             model_fit = others.fits[-1]
@@ -116,7 +118,7 @@ def diagnose(
             told.append(remark("odd_trials", odd=odd, names=names, others=len(others.fit.trials)))
             result = replace(others, odd_trials=names)
     result = with_lost_frames(result, dropped)
-    told.append(longer_than_stated(pairs))
+    told += [longer_than_stated(pairs), ends_short(pairs)]
     if far_off := _far_off(result.fits[-1]):
         told.append(remark("far_off", names=list(far_off), percent=100 * max(far_off.values())))
     outliers = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
@@ -152,7 +154,7 @@ def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Dia
         effects=tuple(step.answer_names[0] for step in steps[:-1]),
         explanation=explanation,
         not_tried=tuple(not_tried),
-        fits=(fit, *(step.tests.fit for step in steps[1:])),
+        fits=tuple(step.tests.fit for step in steps),
         power=power_of(steps[-1].tests, not_testable),
         refused=str(remark("take_effects_out")) if steps[-1].is_open else "",
     )

@@ -121,6 +121,17 @@ class Search:
                 self._fit_from_prediction(tests, effects, name)
         return self.of_size(len(effects) + 1)
 
+    def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
+        """A likelier fit of the model itself, from the best hypothesis of those that gain though they have no size
+        beyond two errors: the fit had ended in a local maximum, and they in a higher one. None where there is none.
+        """
+        gaining = [one for one in hypotheses if one.delta_chi2 > ANSWER_SET_DELTA_CHI2 and not one.split]
+        sizeless = [one for one in gaining if size_in_errors(one.effects[0], one.fit) < 2]
+        if not sizeless:
+            return None
+        fit = full_fit(best_of(sizeless).fit, self.before.model, between=self.before.predictor.layout.between)
+        return fit if fit and fit.log_likelihood > self.before.log_likelihood + 1 else None
+
     def _fit_from_afar(self) -> None:
         """Fit effects from sizes that no prediction reaches, a wrong power of ten, held until all else has adapted."""
         fixed = self.before.options["fixed"]
@@ -508,13 +519,16 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
 
     # The most promising single effects, a tail that may go slack, and differences between trials.
     search = Search(tests, report)
+    search.extend()
     slack = slack_fit(fit, report) if tests.rejects_model else None
     alone = [] if slack is None else [slack]
-    best_gain = max((hypothesis.delta_chi2 for hypothesis in (*search.extend(), *alone)), default=0.0)
+    best_gain = max((hypothesis.delta_chi2 for hypothesis in (*search.of_size(1), *alone)), default=0.0)
     between = between_fits(fit, trial_differences, best_gain, report)
     unstated_names = {difference.name for difference in differing if not difference.stated}
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
     alone += between
+    if (higher := search.higher_base([*search.of_size(1), *alone])) is not None:
+        return select_effects(higher, effects, report)
 
     def nothing_found(verdict: str = passed) -> list[SelectionStep]:
         differ = unstated if verdict == ADEQUATE else ()

@@ -628,9 +628,10 @@ def _splined(trace: Recorded, clock: tuple[float, float]) -> tuple[Floats, float
     # White noise is assumed: a changing pressure can mimic a correlation of the noise.
     white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
     # 0.85: part of the squares of the noise that the spline leaves, the rest for its knots (measured)
-    few = places.size < 5
+    order, left = (1, 0.0) if places.size < 5 else (3, 0.85 * places.size)
     weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
-    spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
+    # ext=3: constant beyond the readings, from which a cubic runs away
+    spline = UnivariateSpline(places, values_Pa, weights, k=order, s=left, ext=3)
     alone = Curves([trace], clock)
     ((_, mean_error_Pa, errors_Pa),) = alone.all()
     larger = math.sqrt(max(float(alone.excess[0]), 1.0))

@@ -279,3 +279,19 @@ def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
     _, trial, travel_m = max(longer, key=lambda one: one[0])
     facts = {"count": len(longer), "name": trial.name, "travel_m": travel_m, "length_m": trial.length_m}
     return remark("longer_than_stated", **facts)
+
+
+def ends_short(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
+    """Say of which vine all tracks come to rest at one place short of its length; blank where none do."""
+    rests: dict[tuple[str, float], list[float]] = {}
+    for trial, track in pairs:
+        ended = with_flag(track.flag, "after_end") & np.isfinite(track.lead_position_m)
+        if ended.any() and track.usable.any() and trial.travel_ratio != 1:
+            travel_m = np.median(track.lead_position_m[ended]) - np.median(track.lead_position_m[track.usable][:3])
+            rests.setdefault((trial.vine, trial.length_m), []).append(float(travel_m))
+    for (vine, length_m), travels in rests.items():
+        # 3, 0.02, 0.97: tracks that tell a place, and parts of the length by which they agree and up to which (chosen)
+        if len(travels) >= 3 and np.ptp(travels) < 0.02 * length_m and max(travels) < 0.97 * length_m:
+            facts = {"count": len(travels), "vine": vine, "travel_m": float(np.median(travels)), "length_m": length_m}
+            return remark("ends_short", **facts)
+    return Remark()

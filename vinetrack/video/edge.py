@@ -469,7 +469,7 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 
 # Power of a column's change over that of its noise from which it counts as changed; length of a run of columns, px, of
 # which six in ten must have changed for a front to have passed (chosen)
-LEAST_CHANGE, RUN_PX = 70.0, 9
+LEAST_CHANGE, RUN_PX = 30.0, 9
 
 
 def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
