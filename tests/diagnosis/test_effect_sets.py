@@ -53,7 +53,7 @@ def worth_of_the_last(triple: LikelihoodRatio, sets: Search) -> float:
 @pytest.fixture(autouse=True)
 def no_refit_succeeds(monkeypatch):
     """Likelihoods and scatter are given; some tests replace this, and campaigns, made once, come before it."""
-    monkeypatch.setattr(Search, "_refit", lambda *_: None)
+    monkeypatch.setattr(Search, "_refit", lambda *_, **_how: None)
     monkeypatch.setattr(selection, "robust_ratio", lambda *_: 1.0)
 
 
@@ -132,7 +132,7 @@ def test_significance_is_that_of_the_tail_however_far_out(delta_chi2, degrees):
 def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(monkeypatch, end, needed):
     """All pairs are known, 30 σ below the triple; the last one ends higher when it is fitted from the triple."""
 
-    def refit(sets: Search, _fit, effects) -> None:
+    def refit(sets: Search, _fit, effects, **_how) -> None:
         names = tuple(effect.name for effect in effects)
         sets._keep_best(of(names, end if {*names} == {*NAMES[:2]} else TRIPLE - 450.0))
 
@@ -149,6 +149,17 @@ def test_where_effects_of_no_size_gain_the_model_itself_is_fitted_again_from_the
     monkeypatch.setattr(selection, "full_fit", lambda *_, **_how: fit)
     gaining = replace(of(["air_drag"], -890.0, numbers=[number]), delta_chi2=220.0)
     assert (search.higher_base([gaining]) is fit) == higher
+
+
+def test_the_limit_of_an_effect_is_fitted_from_where_that_ended(monkeypatch):
+    """A chamber whose supply never refills it is one that empties."""
+    refill, limit, begun = of(["supply_refill"], -900.0), find_effect("reservoir_depletion"), []
+    refill.fit.model = SimpleNamespace(values={"supply_refill.gamma": 1.25, "supply_refill.tau": 3500.0})
+    search = sets_of([refill])
+    search.tests.effects = (limit, find_effect("leak"))
+    monkeypatch.setattr(Search, "_refit", lambda *given, start: begun.append((given[2], start)))
+    search._fit_contained(refill)
+    assert begun == [([limit], {"reservoir_depletion.gamma": 1.25})]
 
 
 def asked(*names: str, **how: bool) -> result.Diagnosis:

@@ -86,20 +86,6 @@ def test_scatter_of_damping_and_pressure_is_as_stated():
     assert np.std(release % 1) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
 
 
-def test_noise_has_the_stated_deviation_and_correlation():
-    """Rest frames alone, 4000 of them: errors of 2 % for the deviation (or more), 0.016 for the latter."""
-    at_rest = {"release_frames": (4000, 4000), "longest_frames": 4000}
-    hidden = nature(seed=11, noise_m=2e-4, noise_correlation=0.6, **at_rest)
-    noise = campaigns.grow(few()[:1], hidden)[0]
-    assert (noise.true_lead_position_m == 0).all()
-    residual = noise.track.lead_position_m - noise.origin_m
-    assert residual.std() == pytest.approx(2e-4, rel=0.08)
-    assert abs(residual.mean()) < 2e-5
-    centred = residual - residual.mean()
-    assert centred[1:] @ centred[:-1] / (centred @ centred) == pytest.approx(0.6, abs=0.06)
-    assert centred[2:] @ centred[:-2] / (centred @ centred) == pytest.approx(0.36, abs=0.08)
-
-
 def test_a_recorded_pressure_is_what_drove_it_and_noise():
     trials = [replace(trial, chamber_m3=1e-3) for trial in few()]
     effects = (*campaigns.GroundTruth().effects, "reservoir_depletion")

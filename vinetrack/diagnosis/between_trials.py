@@ -228,11 +228,10 @@ def differences(fit: Fit) -> list[Difference]:
 
 
 def _p_value(fit: Fit, difference: Difference, gain: float, extra: int) -> float:
-    """p-value of a gain by `extra` coefficients where trials do not differ. For fixed coefficients by the F test, LR =
-    N ln(1 + q F / dof), because χ² would be anticonservative for few trials. For random effects of given standard
-    deviations exp(gain / 2) would be a Bayes factor K, with P(K > 1/α) ≤ α by Markov's inequality, were it not for
-    parameters and scatter, which both hypotheses fit: in simulations of 8 to 24 trials in 2 to 6 groups, α was exceeded
-    by no more than 0.07 α.
+    """p-value of a gain by `extra` coefficients where trials do not differ. For fixed ones by the F test, LR = N ln(1 +
+    q F / dof): χ² would be anticonservative for few trials. For random effects exp(gain / 2) would be a Bayes factor K,
+    P(K > 1/α) ≤ α by Markov's inequality, were it not for parameters and scatter, which both hypotheses fit: in
+    simulations of 8 to 24 trials in 2 to 6 groups, α was exceeded by no more than 0.07 α.
     """
     if gain <= 0:
         return 1.0

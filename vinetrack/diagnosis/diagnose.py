@@ -104,9 +104,9 @@ def diagnose(
 
     result = diagnosed(fit)
     last_fit = (*result.fits, *result.rounds[-1].partial_fits)[-1]
-    named = [row.kind for row in result.rounds[-1].ranking if row.in_answer_set]
-    nothing_named = result.final_verdict in (ADEQUATE, UNEXPLAINED) or set(named) == {BETWEEN_TRIALS}
-    if nothing_named and (names := odd_trials(last_fit)):
+    named = {row.kind for row in result.rounds[-1].ranking if row.in_answer_set}
+    unnamed = result.final_verdict in (ADEQUATE, UNEXPLAINED) or named == {BETWEEN_TRIALS}
+    if unnamed and (names := odd_trials(last_fit)):
         others = diagnosed(initial_fit(model, [pair for pair in pairs if pair[0].name not in names], effects))
         if others.final_verdict == ADEQUATE:
             model_fit = others.fits[-1]

@@ -204,10 +204,9 @@ def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats])
 def integrate_responses(
     time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats
 ) -> tuple[Floats, Floats]:
-    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
-    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
-    Anal. 14, 1006 (1977). Returns changes of position, m, and velocity, m/s, (n_trials, n_times, n). Shapes: time_s,
-    stiffness, friction (n_trials, n_times); acceleration (n_trials, n_times, n).
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion, by the L-stable,
+    singly diagonally implicit Runge-Kutta scheme of two stages of Alexander, SIAM J. Numer. Anal. 14, 1006 (1977), to
+    changes of position, m, and velocity, m/s, (n_trials, n_times, n). Shapes: acceleration as these; others without n.
     """
     gamma = 1 - 1 / math.sqrt(2)  # Its diagonal coefficient (derived)
     courses = stiffness[:, :, None], friction[:, :, None], acceleration
@@ -314,10 +313,9 @@ class ForceEstimate(NamedTuple):
 
 
 class ForceProblem:
-    """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
-    noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
-    have the standard deviations estimated from replicates. `start` has the fitted parameters, and motions that lie on
-    the tracks, whatever the model says.
+    """A fit, the noise of its tracks, with which misfit of the model does not count as noise, and the priors of its
+    parameters and trial effects, those of pressure and B from replicates: what is asked of forces. `start` has the
+    fitted parameters, and motions that lie on the tracks, whatever the model says.
     """
 
     def __init__(self, fit: Fit) -> None:
@@ -368,9 +366,8 @@ class ForceProblem:
 
 class ForceEquations:
     """The normal equations of the coefficients of a force about a point, where they have given values (0): unknowns
-    beside the parameters (`joint`). `cost` is χ² there with the priors of all other unknowns, `chi2` that with all
-    others estimated anew. `information` (q, q) and `score` (q,) are those of the coefficients with all other unknowns
-    eliminated.
+    beside the parameters (`joint`). `cost` is χ² there with the priors of all others, `chi2` that with all others
+    estimated anew; `information` (q, q) and `score` (q,) are those with all others eliminated.
     """
 
     def __init__(

@@ -131,10 +131,9 @@ def size_in_errors(effect: Effect, after: Fit) -> float:
 
 
 def sizes_of(effects: Sequence[Effect], after: Fit) -> int:
-    """Number of sizes of effects in a fit: the degrees of freedom of their likelihood ratio. The first parameter of an
-    effect is its size, one for all trials or one for each vine or day. The others shape the effect. Where its size is
-    zero nothing depends on them, so that Wilks' theorem does not hold for them (Davies, Biometrika 74, 33, 1987): the
-    likelihood ratio is the largest of many with one degree of freedom.
+    """Number of sizes of effects in a fit, the degrees of freedom of their likelihood ratio: the first parameter of
+    each, for all trials or for each vine or day. The others shape it: where its size is zero nothing depends on them,
+    so that Wilks' theorem does not hold (Davies, Biometrika 74, 33, 1987): it is the largest ratio of many.
     """
     sizes = [f"{effect.name}.{effect.parameters[0].name}" if effect.parameters else "" for effect in effects]
     return sum(max(sum(number.key == size for number in after.numbers), 1) for size in sizes)

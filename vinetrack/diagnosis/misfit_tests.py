@@ -298,10 +298,9 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 @dataclass(frozen=True)
 class Products:
-    """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the fit's
-    noise, shape (n_trials, n_columns, n_columns); the residual is taken with the trial effects at their prior means.
-    `problem` is that of the fit with the systematic errors as further parameters; `silent` names the effects to which
-    no trajectory responds at any plausible size.
+    """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the noise,
+    with the residual at the prior means of trial effects, (n_trials, n_columns, n_columns). `problem` has systematic
+    errors as further parameters; to the effects in `silent` no trajectory responds at any plausible size.
     """
 
     white: Floats
@@ -398,9 +397,8 @@ class Scores:
         return np.nan_to_num(scatter / self.informed, nan=math.inf)
 
     def one_sided(self, signs: Sequence[int]) -> Floats:
-        """Score of every shape in standard errors (z) where its sign, 0 for either, is allowed; 0 where it is not. The
-        smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to the
-        normal quantile of the same tail probability.
+        """Score of every shape in standard errors (z), 0 where its sign is not allowed (0: either is). The smaller of
+        two: by the noise model, and by the scatter of trials, whose Student's t is converted to a normal quantile.
         """
         size, sign = self.size, np.array(signs)
         allowed_size = np.where(sign == 0, np.abs(size), np.maximum(size * sign, 0.0))

@@ -67,8 +67,7 @@ SPLINES = {"growth": (24, 20), "speed": (16, 8), "time": (16, 8), "pressure": (7
 @dataclass(frozen=True)
 class Axis:
     """A variable of a force, the range that was visited, SI, and the number of splines along it. Where `log_ratio` is
-    not 0, it is taken as its logarithm from 1 to 1 + that: speeds and durations of a campaign span decades, and forces
-    change over fractions of them.
+    not 0, it is its logarithm, from 1 to 1 + that: forces change over fractions of speeds that span decades.
     """
 
     name: str
@@ -353,9 +352,8 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
 
 
 def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
-    """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
-    less: far from the solution, two are often the more likely for errors of the linear equations alone. Motions respond
-    in full, by steps with new estimates of the coefficients.
+    """The motions under the most probable force of the likeliest variable or two, whichever leave less: far from the
+    solution, two often look likelier for errors of the linear equations. Motions respond in full, by steps.
     """
     inflation, found = problem.inflation(_least_chi2(choices)), [(math.inf, choices[0].equations.point)]
     by_evidence = sorted(choices, key=lambda choice: -choice.found.log_evidence)

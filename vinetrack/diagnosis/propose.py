@@ -194,9 +194,8 @@ def _table_code(domain: Domain) -> list[str]:
 
 @dataclass(frozen=True)
 class Proposed:
-    """A law, or the learned force as a table, that was fitted as an effect. `text` is the source of its file, by where
-    it comes from. `rms_left_out_m` is its error on left-out conditions, m, of a table that was learned from all trials;
-    NaN where the likelihood of others is far higher.
+    """A law, or the learned force as a table, fitted as an effect. `text` is the source of its file, by where it comes
+    from; `rms_left_out_m` its error on left-out conditions, NaN where the likelihood of others is far higher.
     """
 
     words: str

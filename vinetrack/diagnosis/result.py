@@ -102,9 +102,8 @@ class PowerInput:
 
 @dataclass(frozen=True)
 class SimulatedRates:
-    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank. `count`
-    of `campaigns` are those in which the effect was found (where nothing is missing: anything); `promised` is its
-    probability by linear theory (that of a false alarm); `named` counts what was named, most frequent first.
+    """Outcomes of complete diagnoses of simulated campaigns with one effect, none where blank. `count` of `campaigns`
+    found it (where nothing is missing: anything), `promised` is its probability in theory, `named` what was named.
     """
 
     effect: str
@@ -141,11 +140,9 @@ class SimulatedRates:
 
 @dataclass(frozen=True)
 class FurtherTrials(JsonRecord):
-    """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
-    `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
-    limits; `n_conditions` counts the conditions considered. `trials` has an entry for each trial to make: its cells of
-    the sheet without blank ones, `vine`, `new_vine`, what is `changed` on the rig, and the `probability` once it is
-    made as well.
+    """Further trials that bring the power for an effect of one size to a target: `power` with them, the probability
+    `before`, and that with `unlimited` replicates within the limits; `n_conditions` were considered. `trials` has for
+    each to make its cells of the sheet, `vine`, `new_vine`, what is `changed` on the rig, and the `probability` then.
     """
 
     power: Annotated[EffectPower, Field(exclude=True)]
@@ -178,8 +175,7 @@ StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSeriali
 @dataclass(frozen=True)
 class Power(Drawn, JsonRecord):
     """Which effects the trials of a campaign can detect, at which sizes, and `numbers`, the damping law that they
-    determine. Printed, it is the text on the terminal.
-    The probability of any false alarm is at most `false_alarm_rate`.
+    determine; any false alarm is at most as likely as `false_alarm_rate`. Printed, it is the text on the terminal.
     """
 
     n_trials: int = 0
@@ -261,9 +257,8 @@ BETWEEN_TRIALS = "between_trials"  # Kind of a hypothesis that trials differ
 
 @dataclass(frozen=True)
 class Candidate(JsonRecord):
-    """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L when it is added (the
-    squared score where only `screened`), and `sigma` its significance as a normal deviate, with one degree of
-    freedom for each size.
+    """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L with it (the squared score where
+    only `screened`), `sigma` its significance as a normal deviate, with a degree of freedom for each size.
     """
 
     effect: str

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, reduce
+from typing import Any
 
 import numpy as np
 
@@ -101,9 +102,8 @@ class Search:
     def extend(
         self, base: LikelihoodRatio | None = None, most: int | None = None, *, every: bool = False
     ) -> list[LikelihoodRatio]:
-        """Add candidates of large predicted gain to a set, at `most` so many, or every one: a model whose parameters
-        have adapted to the lack of an effect may predict no gain for it, not even the right sign. Returns all sets of
-        this size.
+        """Add candidates of large predicted gain to a set, at `most` so many, or every one: a model that has adapted to
+        the lack of an effect may predict no gain for it, not even the right sign. Returns all sets of this size.
         """
         tests, effects = (self.tests_after(base.fit), base.effects) if base else (self.tests, ())
         if not self.tried and is_poor_fit(self.before.predictor, self.before.solution):
@@ -119,7 +119,20 @@ class Search:
             if (of_base, name) not in self.tried:
                 self.tried.add((of_base, name))
                 self._fit_from_prediction(tests, effects, name)
+        for best in self.of_size(len(effects) + 1)[:1]:
+            self._fit_contained(best)
         return self.of_size(len(effects) + 1)
+
+    def _fit_contained(self, hypothesis: LikelihoodRatio) -> None:
+        """Fit what a set contains as a limit, unless known, from where that ended: its own starts may not get there."""
+        values = hypothesis.fit.model.values
+        for effect in hypothesis.effects:
+            for limit in (one for one in self.tests.effects if one.name in effect.replaces):
+                members = [limit if one is effect else one for one in hypothesis.effects]
+                if frozenset(one.name for one in members) not in self.fitted:
+                    shared = [p.name for p in limit.parameters if f"{effect.name}.{p.name}" in values]
+                    start = {f"{limit.name}.{name}": values[f"{effect.name}.{name}"] for name in shared}
+                    self._refit(hypothesis.fit, members, start=start)
 
     def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
         """A likelier fit of the model itself, from the best hypothesis of those that gain though they have no size
@@ -190,8 +203,7 @@ class Search:
         self, hypothesis: LikelihoodRatio, effects: Sequence[Effect], *, again: bool = False
     ) -> LikelihoodRatio | None:
         """Some members of a set alone, refitted from the set unless known already; None where no fit succeeds. `again`:
-        the fit that is known may have ended in a local minimum, which would make the others look needed, and the better
-        of the two counts.
+        what is known may have ended in a local minimum and make the others look needed; the better of the two counts.
         """
         names = frozenset(effect.name for effect in effects)
         if again or names not in self.fitted:
@@ -199,9 +211,9 @@ class Search:
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
 
-    def _refit(self, fit: Fit, effects: Sequence[Effect]) -> None:
+    def _refit(self, fit: Fit, effects: Sequence[Effect], **how: Any) -> None:
         """Keep a set that is fitted from another one, unless no fit succeeds."""
-        if after := full_fit(fit, reduce(Model.__add__, effects, self.before.model)):
+        if after := full_fit(fit, reduce(Model.__add__, effects, self.before.model), **how):
             self._keep_best(likelihood_ratio(self.before, effects, after))
 
     @cached_property
@@ -252,9 +264,8 @@ class Search:
         return reason if lost > ANSWER_SET_DELTA_CHI2 * hypothesis.inflation else Remark()
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
-        """Whether a set is better than a smaller one, by default the best of one effect fewer, by at least the
-        threshold of what it has more than the best one within it. A smaller set that is not within it fits no worse
-        than that one, so the criterion is then the stricter.
+        """Whether a set is better than a smaller one, by default the best of one effect fewer, by the threshold of what
+        it has more than the best one within it: a stricter criterion where the smaller one is another.
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
         within = self.best_within(hypothesis) or smaller
@@ -362,10 +373,9 @@ def with_curves(fit: Fit) -> Fit:
 def adequate_hypotheses(
     hypotheses: Sequence[LikelihoodRatio], search: Search
 ) -> tuple[list[LikelihoodRatio], dict[str, Remark], MisfitTests | None]:
-    """Test the model with each hypothesis of the answer set added, and keep those that no test rejects. A hypothesis
-    that leaves a significant misfit is rejected, and no longer sets the likelihood that others are compared with.
-    Returns adequate (the likeliest first; empty where every hypothesis is rejected), rejected (reason by label), after
-    (tests of the model with the first adequate hypothesis added).
+    """Test the model with each hypothesis of the answer set added, and keep those that no test rejects; one that leaves
+    a significant misfit no longer sets the likelihood that others are compared with. Returns adequate (the likeliest
+    first, perhaps none), rejected (reason by label), after (tests of the model with the first adequate one added).
     """
     _, rejected = answer_set(hypotheses)
     best, by_likelihood = best_of(hypotheses), sorted(hypotheses, key=lambda ratio: -ratio.fit.log_likelihood)
@@ -475,9 +485,8 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One round of the selection: a model, its tests, and the hypotheses compared. `answer_set` holds the hypotheses
-    that cannot be excluded (of sets of effects, what they add to the effects of earlier rounds), `answer_names` their
-    names; `fitted` every hypothesis fitted; `rejected` labels and reasons.
+    """One round of the selection: a model, its tests, and the hypotheses compared. Those of the `answer_set` cannot be
+    excluded (of sets, what they add to the effects of earlier rounds); `rejected` are labels and reasons.
     """
 
     verdict: str

@@ -187,7 +187,9 @@ def prepare_trial(
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     # 8.0: standard deviations by which the edge must move for a trial to be fitted
     if not moved_m > 8.0 * noise_m or moved_m <= 0:
-        raise FitError("its leading edge never moves forward beyond its noise")
+        backwards = "its position decreases while it grows: change the sign, or the points that it is made of"
+        never = "its leading edge never moves forward beyond its noise"
+        raise FitError(backwards if moved_m < -8.0 * noise_m else never)
     n_rest = 0 if imprecise_rest is not None else rest_points(position_m)
     moving = time_s.size - n_rest
     if 0 < moving < fewest_moving:
