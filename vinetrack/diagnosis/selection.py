@@ -135,14 +135,14 @@ class Search:
                     self._refit(hypothesis.fit, members, start=start)
 
     def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
-        """A likelier fit of the model itself, from the best hypothesis of those that gain though they have no size
-        beyond two errors: the fit had ended in a local maximum, and they in a higher one. None where there is none.
+        """A likelier fit of the model itself, from the best hypothesis where that gains without a size beyond two
+        errors: the fit had ended in a local maximum, and that in a higher one. None where there is none.
         """
         gaining = [one for one in hypotheses if one.delta_chi2 > ANSWER_SET_DELTA_CHI2 and not one.split]
-        sizeless = [one for one in gaining if size_in_errors(one.effects[0], one.fit) < 2]
-        if not sizeless:
+        best = best_of(gaining) if gaining else None
+        if best is None or size_in_errors(best.effects[0], best.fit) >= 2:
             return None
-        fit = full_fit(best_of(sizeless).fit, self.before.model, between=self.before.predictor.layout.between)
+        fit = full_fit(best.fit, self.before.model, between=self.before.predictor.layout.between)
         return fit if fit and fit.log_likelihood > self.before.log_likelihood + 1 else None
 
     def _fit_from_afar(self) -> None:
