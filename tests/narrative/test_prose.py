@@ -35,7 +35,7 @@ def test_no_module_outside_the_room_of_prose_parses_it():
 
 
 def test_every_code_has_a_sentence_and_every_sentence_a_code():
-    makers = ("inference", "diagnosis", "planning", "pipeline")
+    makers = ("tracks", "inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= templates().keys() | REMARKS.keys()
     assert [code for code in REMARKS if not re.search(rf"""["']{code}["']""", source)] == []
