@@ -466,7 +466,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.inference.fit_data import not_measured
     from vinetrack.planning.predictive_inputs import pressure_problems
-    from vinetrack.tracks.frame_timing import longer_than_stated, mean_speed
+    from vinetrack.tracks.frame_timing import ends_short, longer_than_stated, mean_speed
     from vinetrack.tracks.importers import track_lines
     from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
     from vinetrack.video.axis import askew_trials, axis_entry
@@ -490,8 +490,9 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
         for name, why in not_measured(tracks).items()
     ]
-    if longer := longer_than_stated(tracks):
-        problems.append(Problem("longer_than_stated", str(longer), "length_mm", severity="warning", file=SHEET))
+    for told, severity in ((longer_than_stated(tracks), "warning"), (ends_short(tracks), "note")):
+        if told:
+            problems.append(Problem(told.code, str(told), "length_mm", severity=severity, file=SHEET))
     speeds = [(trial, entry.mean_speed_m_s) for trial, entry in surveyor.facts.items()]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on sizes and positions, so it is tested only if these have no errors.
