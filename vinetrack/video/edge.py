@@ -486,13 +486,12 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     weight = 1 / (np.abs(last - first) + np.float32(4.0 * strip.noise))
     votes = kernels.votes(strip.values, strip.scale, strip.offset, first, last, weight)
     path = dividing_path(votes)
-    # Film stays. A payload that flies on, no longer than the tube is wide, leaves columns that changed and turned back;
-    # a quarter of the least change tells that (chosen)
+    # Film stays. A payload that flies on, no longer than the tube is wide, leaves columns that changed and turned back.
     for end, begin in itertools.pairwise([*by_now.tolist(), len(first[0])]):
         if begin - end > RUN_PX and by_now[-1] - begin < len(first):
             left, after = slice(end + RUN_PX // 2, begin - RUN_PX // 2), np.flatnonzero(path > end - RUN_PX)
             change = np.mean((strip.brightness(after)[:, :, left] - first[:, left]) ** 2, axis=1)
-            if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE / 4 * strip.noise**2:
+            if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE * strip.noise**2:
                 changed, by_now = changed[changed <= end], by_now[by_now <= end]
                 break
     first_column, last_column = max(min(changed, default=0), column_after_leap(path)), max(changed, default=-1)
