@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,7 @@ def test_check_names_a_copied_track_and_one_that_is_longer_than_its_vine(tmp_pat
     ended = [(trial, track.flagged(np.arange(150, 200), "after_end")) for trial, track in pairs_of(tmp_path)[0]]
     assert ends_short(ended).facts["travel_m"] == pytest.approx(0.245, abs=0.01)
     assert not ends_short(ended[:2] + ended[3:])  # two of a vine of 400 mm, one that is as long as it is
+    assert not ends_short((replace(trial, frames_used=(0, 150)), track) for trial, track in ended)  # not at rest there
 
 
 def test_a_check_of_the_same_files_is_made_once_and_one_that_finds_an_error_each_time(tmp_path, monkeypatch):

@@ -129,18 +129,19 @@ class Search:
         for effect in hypothesis.effects:
             for limit in (one for one in self.tests.effects if one.name in effect.replaces):
                 members = [limit if one is effect else one for one in hypothesis.effects]
-                if frozenset(one.name for one in members) not in self.fitted:
+                asked = frozenset(hypothesis.names), limit.name  # once, whether or not it succeeds
+                if asked not in self.tried and frozenset(one.name for one in members) not in self.fitted:
+                    self.tried.add(asked)
                     shared = [p.name for p in limit.parameters if f"{effect.name}.{p.name}" in values]
                     start = {f"{limit.name}.{name}": values[f"{effect.name}.{name}"] for name in shared}
                     self._refit(hypothesis.fit, members, start=start)
 
     def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
         """A likelier fit of the model itself, from the best hypothesis where that gains without a size beyond two
-        errors: the fit had ended in a local maximum, and that in a higher one. None where there is none.
+        errors: the fit had ended in a local maximum, and that in a higher one. None where ln L rises by less than 1.
         """
         gaining = [one for one in hypotheses if one.delta_chi2 > ANSWER_SET_DELTA_CHI2 and not one.split]
-        best = best_of(gaining) if gaining else None
-        if best is None or size_in_errors(best.effects[0], best.fit) >= 2:
+        if not gaining or size_in_errors((best := best_of(gaining)).effects[0], best.fit) >= 2:
             return None
         fit = full_fit(best.fit, self.before.model, between=self.before.predictor.layout.between)
         return fit if fit and fit.log_likelihood > self.before.log_likelihood + 1 else None

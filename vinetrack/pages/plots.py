@@ -132,7 +132,9 @@ Errors = Mapping[str, float]
 
 
 def round_up(value: float, steps: Sequence[float]) -> float:
-    """Return the next of these steps times a power of ten above 0, so that an axis rarely changes."""
+    """Return the next of these steps times a power of ten, so that an axis rarely changes; 1 for nothing, or NaN."""
+    if not value > 0:
+        return 1.0
     power = 10.0 ** math.floor(math.log10(value))
     return next(round(power * step, 12) for step in steps if power * step >= value or step == steps[-1])
 

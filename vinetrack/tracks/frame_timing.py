@@ -282,11 +282,14 @@ def longer_than_stated(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
 
 
 def ends_short(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
-    """Say of which vine all tracks come to rest at one place short of its length; blank where none do."""
+    """Say of which vine all imported tracks come to rest at one place short of its length; blank where none do. A film
+    tells its end itself, and what follows that may lie at the border of the picture.
+    """
     rests: dict[tuple[str, float], list[float]] = {}
     for trial, track in pairs:
         ended = with_flag(track.flag, "after_end") & np.isfinite(track.lead_position_m)
-        if ended.any() and track.usable.any() and trial.travel_ratio != 1:
+        imported = trial.video is None and trial.frames_used is None and trial.travel_ratio != 1
+        if imported and ended.any() and track.usable.any():
             travel_m = np.median(track.lead_position_m[ended]) - np.median(track.lead_position_m[track.usable][:3])
             rests.setdefault((trial.vine, trial.length_m), []).append(float(travel_m))
     for (vine, length_m), travels in rests.items():
