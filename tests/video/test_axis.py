@@ -70,7 +70,7 @@ def test_the_axis_is_that_of_the_tube_beside_a_door_as_long_as_its_growth(growth
     axis = find_growth_axis(small)
     assert type(axis) is Axis
     assert abs(slope_deg(axis)) < 5
-    assert abs((np.array(MOUTH) - axis.from_px) @ axis.normal) < 8
+    assert abs(axis.along_and_across(np.array([MOUTH]))[1][0]) < 8
 
 
 @pytest.mark.parametrize(("tube_px", "brighter"), [(40, -80.0), (100, 80.0), (150, -80.0), (150, 80.0)])

@@ -174,9 +174,8 @@ def busy_frames(pictures: NDArray[np.float32], most: int) -> NDArray[np.float32]
 
 
 def _step_fraction(values: Floats, frame: Indices, noise_power: float) -> Floats:
-    """Fraction of each pixel's variance, beyond noise, that a single step at `frame` explains, shape (n_pixels,).
-    `values` has shape (n_frames, n_pixels). A passing object leaves a pixel as it was, so that a step explains hardly
-    any.
+    """Fraction of each pixel's variance, beyond noise, that a step at `frame` explains, (n_pixels,): hardly any where
+    an object passes. Shapes: values (n_frames, n_pixels).
     """
     n, sums = len(values), np.cumsum(values, axis=0)
     before = np.take_along_axis(sums, np.maximum(frame - 1, 0)[None], axis=0)[0]
@@ -229,8 +228,7 @@ def dividing_path(evidence: np.ndarray) -> np.ndarray:
 
 def collecting_path(score: NDArray[Any]) -> Floats:
     """Find the monotone path that collects the greatest sum of scores, each column counted once, when the path passes
-    it: the path that divides the score's decreases. A column that is passed at once has scored nothing. Shapes: score
-    (n_frames, n_along) → (n_frames,).
+    it; nothing where it is passed at once. Shapes: score (n_frames, n_along) → (n_frames,).
     """
     gains = np.zeros((len(score) + 1, score.shape[1]))
     gains[1:-1] = score[1:]
@@ -331,7 +329,7 @@ class Axis:
     at integers. It is straight where `via_px` is empty, else a natural cubic spline over the centripetal parameter
     (steps of the square root of the distance between neighbours; Lee 1989), which neither overshoots nor loops between
     unevenly spaced points; beyond its ends it continues straight. `width_px` is the width of what moves along it, NaN
-    where unknown; `direction` and `normal` are those of the chord.
+    where unknown; `direction` is that of the chord.
     """
 
     from_px: Point
@@ -341,14 +339,11 @@ class Axis:
 
     def __post_init__(self) -> None:
         if self.bends and np.min(np.hypot(*np.diff(self.through_px, axis=0).T)) < SMALLEST_POINT_SPACING_PX:
-            raise RecordingError(
-                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart",
-                "leave out one",
-            )
+            what = f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
+            raise RecordingError(what, "leave out one")
         if self.length_px < SHORTEST_AXIS_PX:
-            raise RecordingError(
-                f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels", "move from_px and to_px apart"
-            )
+            what = f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels"
+            raise RecordingError(what, "move from_px and to_px apart")
 
     @property
     def bends(self) -> bool:
@@ -385,12 +380,6 @@ class Axis:
         """Unit vector of growth (x, y) from end to end, shape (2,)."""
         chord = np.subtract(self.to_px, self.from_px)
         return chord / np.hypot(*chord)
-
-    @property
-    def normal(self) -> Floats:
-        """Unit vector across, a quarter turn from x towards y, shape (2,)."""
-        along = self.direction
-        return np.array([-along[1], along[0]])
 
     @cached_property
     def least_radius_px(self) -> float:
@@ -446,12 +435,11 @@ class Axis:
         return np.asarray(on_axis + past[..., None] * unit + across[..., None] * normal)
 
     def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
-        """Find where points of the picture lie along and across the axis, px, by their nearest place on it. Shapes:
-        picture_px (n, 2) → (n,) each.
-        """
+        """Where points of a picture lie along and across the axis, px, by their nearest place on it: (n, 2) → (n,)."""
         points = np.asarray(picture_px, dtype=float)
         if not self.bends:
-            return (points - self.from_px) @ self.direction, (points - self.from_px) @ self.normal
+            offset, (x, y) = points - self.from_px, self.direction
+            return offset @ self.direction, offset @ np.array([-y, x])
         from scipy.spatial import KDTree
 
         spline, parameter, arc = self._table
@@ -470,9 +458,7 @@ def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float
 
 
 def axis_entry(axis: Axis) -> dict[str, Any]:
-    """Convert an axis to a JSON mapping, without its width: `from_px`, `to_px`, and of a curve `via_px`. Returns
-    mapping of JSON types.
-    """
+    """An axis as a JSON mapping, without its width: `from_px`, `to_px`, and of a curve `via_px`."""
     entry: dict[str, Any] = {"from_px": axis.from_px, "to_px": axis.to_px}
     return entry | ({"via_px": axis.via_px} if axis.bends else {})
 
@@ -485,18 +471,14 @@ def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
 
 
 def axis_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
-    """Say why an axis cannot be used in a picture, and the remedy; None where it can. Returns the end of a sentence
-    that begins with "the axis", and the remedy; or None.
-    """
+    """Why an axis cannot be used in a picture, as what follows "the axis", and the remedy; None where it can."""
     places = axis.points(np.linspace(0.0, axis.length_px, int(axis.length_px) + 2))
     if (places < -0.5).any() or (places > np.array(size_px) - 0.5).any():
         return f"leaves the picture, {size_px[0]} × {size_px[1]} pixels", "give points inside it"
     if half_px > axis.largest_half_px:
-        return (
-            f"bends with a radius of {axis.least_radius_px:.0f} px, too sharply for a strip of {half_px:.0f} px on "
-            "either side",
-            "give fewer points or a smaller width",
-        )
+        strip = f"a strip of {half_px:.0f} px on either side"
+        what = f"bends with a radius of {axis.least_radius_px:.0f} px, too sharply for {strip}"
+        return what, "give fewer points or a smaller width"
     return None
 
 
@@ -542,9 +524,7 @@ def _line_of_beginning(small: SmallPictures, whole: _Line) -> _Line:
 
 
 def front_share(small: SmallPictures, axis: Axis, of_picture: bool = False) -> float:
-    """Share of the growth along an axis, or of all growth in the picture, that is one front passing once; 0 where
-    hardly any pixel grows there.
-    """
+    """Share of the growth along an axis, or in the whole picture, that is one front passing once; 0 if hardly any."""
     band = float(np.clip(0.6 * axis.width_px / small.factor, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
     along = along_axis(small, small.grown, axis)
     near = along.where(np.abs(along.y) < band)
@@ -656,9 +636,7 @@ def _line_through(
 
 
 def _on_front(along: Pixels, band: float, slack: float) -> Bools:
-    """Mark the pixels that change when the best monotone path along a line passes them, by their places along and
-    across it, px. Shape (n_pixels,).
-    """
+    """Mark the pixels that change when the best monotone path passes them, by their places along and across a line."""
     bin_index = ((along.x - float(along.x.min())) / 2).astype(int)
     inside = np.abs(along.y) < band
     size = along.n_times, int(bin_index.max()) + 1

@@ -66,17 +66,13 @@ class EdgeState:
 
 
 def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Return the length of the motion blur in every frame: smoothed speed times exposure. Shapes: edge (n_frames,) →
-    (n_frames,).
-    """
+    """Length of the motion blur by frame: smoothed speed times exposure. Shapes: edge (n_frames,) → (n_frames,)."""
     smooth = np.convolve(np.pad(np.gradient(edge), 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     return np.clip(smooth, 0, None) * exposure_frames
 
 
 def moving_frames(edge: Floats) -> Bools:
-    """Return the frames in which the edge moves, and those in which it creeps on to its end; all frames if fewer than
-    five do. Shapes: edge (n_frames,) → (n_frames,).
-    """
+    """Frames in which the edge moves or creeps on to its end; all if fewer than five. Shapes: (n_frames,) → same."""
     speed, frames = np.abs(np.gradient(edge)), np.arange(len(edge))
     moving = speed > max(0.2, 0.1 * np.sort(speed)[int(0.95 * (len(speed) - 1))])
     # 2.0: distance from its end up to which an edge has come to rest, px (chosen)
@@ -85,9 +81,7 @@ def moving_frames(edge: Floats) -> Bools:
 
 
 def informative_frames(edge: Floats) -> Bools:
-    """Return the frames that determine film, background and tip shape. They are the frames in motion, and MEMORY_CUTOFF
-    memories before and after. Shapes: edge (n_frames,) → (n_frames,).
-    """
+    """Frames that determine film and background: those in motion, and MEMORY_CUTOFF memories before and after."""
     moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * kernels.MEMORY_CUTOFF)
     frames = np.arange(len(edge))
     return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
@@ -131,16 +125,12 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
 
 
 def clear_of_start(edge: Floats) -> float:
-    """Return the column beyond which nothing that held the tip at its start is near. It lies START_CLEARANCE_PX, or a
-    fifth of the growth if that is less, beyond the start. Shapes: edge (n_frames,).
-    """
+    """Column beyond which nothing that held the tip at its start is near. Shapes: edge (n_frames,)."""
     return float(edge[0] + min(START_CLEARANCE_PX, 0.2 * (edge.max() - edge[0])))
 
 
 def core_frames(state: EdgeState, fit: Floats) -> Bools:
-    """Select the frames that determine the shape of the tip. They are in motion, clear of the start, and fit no worse
-    than most. Shapes: fit (n_frames, 5) → (n_frames,).
-    """
+    """Frames that determine the shape of the tip: in motion, clear of the start, and fitted no worse than most."""
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
     if not np.isfinite(fit[clear if clear.sum() >= 5 else moving, 2]).any():
@@ -152,9 +142,7 @@ def core_frames(state: EdgeState, fit: Floats) -> Bools:
 
 
 def fit_edges(strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS) -> Floats:
-    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 5), NaN
-    in the other frames.
-    """
+    """Fit the edge of the chosen frames; see `edge_kernels.fit_edges`. Shape (n_frames, 5), NaN in the other frames."""
     frames = np.flatnonzero(np.isfinite(state.edge) & chosen)
     out = np.full((len(state.edge), 5), np.nan)
     out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds)
@@ -162,9 +150,7 @@ def fit_edges(strip: Strip, state: EdgeState, chosen: Bools | bool = True, round
 
 
 def search_edges(strip: Strip, state: EdgeState, frames: Indices, starts: Floats, rounds: int = FIT_ROUNDS) -> Floats:
-    """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
-    (n_searches,).
-    """
+    """Fit the edge from several starts, in any frames; see `edge_kernels.fit_edges`. frames, starts (n_searches,)."""
     contrast_prior_sd = 0.15  # Prior deviation of relative amplitude and level of the contrast in one frame (chosen)
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, starts, state.lengths, state.lag, state.blur, state.appearance,
@@ -300,8 +286,6 @@ def _least_misfit(candidates: Floats, misfits: Floats) -> float:
         return float(candidates[i])
     x, y = np.log(candidates[i - 1 : i + 2]), misfits[i - 1 : i + 2]
     curve = np.polyfit(x - x[1], y, 2)
-    if curve[0] <= 0:
-        return float(candidates[i])
     return float(np.exp(x[1] + np.clip(-curve[1] / (2 * curve[0]), x[0] - x[1], x[2] - x[1])))
 
 
@@ -396,14 +380,12 @@ BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
 
 
 def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
-    """Look for a launcher's mouth: a straight border that stays where the edge rested. Returns the frames in which the
-    edge stands there and the tip may move behind it, (n_frames,).
-    """
+    """Frames in which an edge rests at a launcher's mouth, a straight border that stays, the tip perhaps behind it."""
     fewest_rest_frames = 3  # Fewest frames of rest from which the resting place is known (chosen)
     film_range_px = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
     search_px = 3  # Distance from the resting place within which a border is looked for (chosen)
-    none = np.zeros(len(edge), dtype=bool)
-    first = int(np.flatnonzero(moving_frames(state.edge))[0])
+    frames, first = np.arange(len(edge)), int(np.flatnonzero(moving_frames(state.edge))[0])
+    none = frames < 0
     if first < fewest_rest_frames:
         return none
     rest_px = float(np.median(edge[:first]))
@@ -431,7 +413,7 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Bools:
     # 0.95: part of the rows that must show the border with the same sign (measured)
     if straight < 0.95 or abs(border_step) < least_step:
         return none
-    return np.arange(len(edge)) < first + int(np.argmax(edge[first:] > rest_px + 3 * state.blur + 1))
+    return frames < first + int(np.argmax(edge[first:] > rest_px + 3 * state.blur + 1))
 
 
 def _near_start(edge: Floats) -> Bools:
@@ -573,11 +555,9 @@ class EdgeTracker(Tracker):
                 state = find_shading(strip, state, fit)
             steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
             fit = repair_jumps(strip, state, fit_edges(strip, state, informative, steps), informative, cost)
+            change_px = np.abs(fit[:, 0] - before)[moving_frames(state.edge)]
             # 0.2: the iteration has converged once no edge of a moving frame changes by more than this (chosen)
-            if (
-                iteration >= rounds - 1
-                and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < 0.2
-            ):
+            if iteration >= rounds - 1 and np.nanmax(change_px) < 0.2:
                 break
         fit = np.where(informative[:, None], fit, fit_edges(strip, state, ~informative))
         finished = _with_errors(strip, state, fit, exposure, tube)
@@ -589,9 +569,7 @@ class EdgeTracker(Tracker):
 
 @dataclass(frozen=True)
 class Outline:
-    """Outline of the tube that the front leaves behind, px: its width, and where its middle lies across the strip,
-    `middles_px`, at `places_px` along it.
-    """
+    """Outline of the tube that the front leaves, px: its width, and its middles across the strip at places along it."""
 
     half_px: float
     width_px: float
@@ -630,9 +608,7 @@ def outline(strip: Strip, parts: int) -> Outline:
 
 
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
-    """Return the ends of the run with the greatest sum, interpolated to a fraction of a row (maximum-subarray search).
-    Short gaps do not end the run and isolated glints do not extend it.
-    """
+    """Ends of the run with the greatest sum, to a fraction of a row: no short gap ends it, and no glint extends it."""
     total = np.concatenate([[0.0], np.cumsum(excess)])
     last = int(np.argmax(total[1:] - np.minimum.accumulate(total[:-1])))
     first = int(np.argmin(total[: last + 1]))
