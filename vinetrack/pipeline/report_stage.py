@@ -35,11 +35,24 @@ log = logging.getLogger(__name__)
 
 
 def write_report(job: Job) -> list[str]:
-    """Draw what the report shows, and write `provenance.json` and `report.html`."""
-    lines = compare_with_paper(job) if job.experiment.settings.published else []
+    """Draw what the report shows, write the tables of the paper's numbers, `provenance.json` and `report.html`."""
+    experiment, results, lines = job.experiment, layout.Results(job.results), list[str]()
+    if experiment.settings.published:
+        tables = paper.paper_tables(
+            experiment.trials,
+            paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED,
+            layout.read_fit(results),
+            lambda name: layout.read_result(results.kinematics(name)),
+            layout.read_result(results.steady),
+            damping=layout.read_json(results.damping),
+            scaling=layout.read_json(results.scaling),
+            conditions=layout.read_result(results.conditions),
+        )
+        for name, content in tables.items():
+            write_csv(results.folder / f"{name}.csv", content)
+        lines.append(f"Comparison with the paper: {tally(tables['paper'])}")
     lines += [*draw_overlays(job), *draw_figures(job)]
     job.say("writing the report")
-    experiment, results = job.experiment, layout.Results(job.results)
     settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
     inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
     provenance = layout.describe_run(experiment.folder, inputs, settings, experiment.settings.model)
@@ -125,28 +138,6 @@ def _drawn(names: Sequence[str], folder: Path, trials: tuple[Trial, ...], settin
                 write_bytes(tables.results.figure(name, f".{form}"), data)
             count += 1
     return count
-
-
-# ------------------------------------------------------------------------------
-# Comparison of a results folder with the published numbers and figures: `paper.csv`, and the tables of the figures.
-
-
-def compare_with_paper(job: Job) -> list[str]:
-    """Write `paper.csv`, and the tables of the figures of the paper."""
-    experiment, results = job.experiment, layout.Results(job.results)
-    tables = paper.paper_tables(
-        experiment.trials,
-        paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED,
-        layout.read_fit(results),
-        lambda name: layout.read_result(results.kinematics(name)),
-        layout.read_result(results.steady),
-        damping=layout.read_json(results.damping),
-        scaling=layout.read_json(results.scaling),
-        conditions=layout.read_result(results.conditions),
-    )
-    for name, content in tables.items():
-        write_csv(results.folder / f"{name}.csv", content)
-    return [f"Comparison with the paper: {tally(tables['paper'])}"]
 
 
 # ------------------------------------------------------------------------------
