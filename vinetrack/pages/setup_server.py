@@ -357,9 +357,9 @@ class Desk:
         self._decoded = lru_cache(2)(decoded_clip)  # of the current and the previous recording
         self._tracked: tuple[str, Tracking] | None = None  # the last that was tracked, in pixels
 
-    def _keep(self, inputs: tuple[Any, ...], make: Callable[[], Tracking]) -> Tracking:
+    def _keep(self, film: Path, inputs: tuple[Any, ...], make: Callable[[], Tracking]) -> Tracking:
         """Track again only for another recording, axis or choice of frames: not for a correction or a scale."""
-        key = repr((inputs[0].resolve(), identity(inputs[0]), inputs[1:]))
+        key = repr((film.resolve(), identity(film), inputs))
         if self._tracked is None or self._tracked[0] != key:
             self._tracked = key, make()
         return self._tracked[1]

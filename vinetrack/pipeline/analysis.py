@@ -40,7 +40,7 @@ from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
 from vinetrack.dynamics.audit import audit, motion_since
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import load_effect, remember
-from vinetrack.experiment.folder import Experiment
+from vinetrack.experiment.folder import SETTINGS, Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
 from vinetrack.figures.registry import features
@@ -211,18 +211,17 @@ def _draw(
 ) -> None:  # fmt: skip
     """Draw the motion of a trial, and the strip of a recording with its tracked edge, unless nothing changed."""
     title, ratio = _described(name, trial)
+    unit = "kPa" if trial is None else trial.pressure_unit
     shown = [results.track(name).read_bytes(), results.kinematics(name).read_bytes(), content]
 
     def motion() -> Figure:
-        drawn = draw_trial(results, trial, name, content["windows"])
-        return drawn or blank(f"{title}: no positions to draw.")
+        return draw_trial(results, trial, name, content["windows"]) or blank(f"{title}: no positions to draw.")
 
     def strip() -> Figure:
         if measurement is None:
             return blank(f"{name}: {reason}")
         return draw_strip(name, measurement.tracking, measurement.m_per_px, unit)
 
-    unit = "kPa" if trial is None else trial.pressure_unit
     kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, motion)
     if trial is not None and trial.video is not None:
         seen = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections, unit)
@@ -517,6 +516,5 @@ def propose_effect(experiment: Experiment, folder: Path, report: Say) -> tuple[l
         remember(path)
         lines.append(f"Written to {path}. Read it, then fit it with `vinetrack add {path} {folder}`.")
     if files:
-        settings = experiment.folder / "experiment.yaml"
-        lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
+        lines.append(f"To test it in the diagnosis, list it under `effects:` in {experiment.folder / SETTINGS}.")
     return lines, list(files)

@@ -203,12 +203,10 @@ class Kept:
         self.folder = folder / ".kept"
         self.tracked = ""
 
-    def track(self, inputs: tuple[object, ...], make: Callable[[], Tracking]) -> Tracking:
-        """The tracking in pixels of a recording (the first input is its path), kept or made."""
-        film, *others = inputs
-        assert isinstance(film, Path)
+    def track(self, film: Path, inputs: tuple[object, ...], make: Callable[[], Tracking]) -> Tracking:
+        """The tracking in pixels of a recording, kept or made."""
         libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2")]
-        state = (code_hash(), libraries, film.resolve(), identity(film), others)
+        state = (code_hash(), libraries, film.resolve(), identity(film), inputs)
         self.tracked = _key(*state)
         return self.made("track", state, make)
 

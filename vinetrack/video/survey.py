@@ -52,14 +52,14 @@ class Measurement:
     recording: Recording
 
 
-Keep = Callable[[tuple[object, ...], Callable[[], Tracking]], Tracking]
+Keep = Callable[[Path, tuple[object, ...], Callable[[], Tracking]], Tracking]
 
 
 def measure_recording(
     trial: Trial, settings: ExperimentSettings, folder: Path, keep: Keep | None = None
 ) -> Measurement:
     """Track the recording of one trial by its own scale or the calibration of the experiment: the one look into a
-    recording. `keep` returns the tracking in pixels that it keeps for these inputs, or makes it by the function given.
+    recording. `keep` returns the tracking in pixels that it keeps of a film with these inputs, or makes it as given.
     """
     if trial.video is None:
         raise RecordingError("no recording is named", "fill in the column video", trial.name)
@@ -78,12 +78,12 @@ def measure_recording(
     axis = given_axis(trial, settings, m_per_px)
     diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
     exposure_s = capture_exposure(trial, recording)
-    inputs = recording.path, trial.frames_used, trial.travel_ratio, capture_fps, exposure_s, axis, diameter_px
+    inputs = trial.frames_used, trial.travel_ratio, capture_fps, exposure_s, axis, diameter_px
 
     def track() -> Tracking:
         return track_pixels(read_event(recording, trial.frames_used), trial, capture_fps, axis, diameter_px)
 
-    tracking = track() if keep is None else keep(inputs, track)
+    tracking = track() if keep is None else keep(recording.path, inputs, track)
     rel_sigma, position_m = math.nan, None
     if calibration is not None:
         bent = tracking.axis.bends and math.isfinite(tracking.tube_width_sigma_px)
