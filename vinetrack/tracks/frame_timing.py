@@ -30,14 +30,10 @@ from vinetrack.tracks.position_noise import (
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
 CLEAR_STEP_SIGMAS = 8.0
-
 # Ratios of a step to its neighbours below which it may repeat a frame, and above which frames were dropped (chosen)
 SHORT_STEP, DROP_RATIO = 0.4, 1.6
-
 JUMP_SIGMAS = 5.5  # Least significance of a jump, in standard errors (derived)
-
 SIDE_POINTS = (8, 5, 3)  # Points used on either side, fewer where release or the end of growth is near (chosen)
-
 # Points on either side that must show at least this part of the jump too, where they are conclusive (chosen)
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
 
@@ -128,9 +124,7 @@ def _noise(track: Track) -> tuple[Floats, float]:
 
 
 def _steps(frame: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Speed of each step, m a frame, and the smaller and the larger of those around it: medians of the three steps
-    before and the three after, NaN where there are none. Shapes: frame, y (n,) → (n − 1,).
-    """
+    """Speed of each step, m a frame, and the smaller and larger of the medians of the three before and after it."""
     import pandas as pd
 
     speed = np.diff(y) / np.diff(frame)

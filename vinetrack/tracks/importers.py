@@ -552,9 +552,7 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
 
 
 def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
-    """Interpolate a pressure trace linearly on the times of a track, which share one clock. Beyond the ends of the
-    trace its first and last values are held, which a note reports. Shapes: time_s, pressure_Pa (n,).
-    """
+    """Interpolate a pressure trace on the times of a track; a note reports where its first or last value is held."""
     start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
     if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):
         message = f"runs from {time_s[0]:g} to {time_s[-1]:g} s, the track from {start:g} to {end:g} s"

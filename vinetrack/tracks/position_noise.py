@@ -30,7 +30,6 @@ from vinetrack.core.records import Bools, Floats, Track, Trial, with_flag
 # under which a fit detects next to nothing. One frame in N carries as much, and its noise is independent.
 
 LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spectra are compared (chosen)
-
 FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
 
 
@@ -126,9 +125,7 @@ def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats])
 
 
 MOVING_STRETCH, MOVING_ORDER = 12, 3  # Points of a stretch in motion, and degree of its polynomial (chosen)
-
 RHO_GRID = np.linspace(0.0, 0.95, 20)
-
 THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences of white noise of unit variance
 
 
@@ -167,9 +164,7 @@ def _frames_at_rest(position_m: Floats) -> int:
 
 
 def rounding_noise(position_m: Floats) -> float:
-    """Estimate the standard deviation of the error of rounded positions (whole pixels, printed decimals). Returns 0
-    where they are not rounded, or where it does not show. Shapes: position_m (n,).
-    """
+    """Standard deviation of the error of rounded positions; 0 where they are not, or where it does not show."""
     floor_m = _rounding_step(position_m) / math.sqrt(12)
     if floor_m == 0:
         return 0.0
@@ -183,9 +178,7 @@ def rounding_noise(position_m: Floats) -> float:
 
 
 def common_rounding_noise(tracks: Sequence[Floats]) -> float:
-    """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
-    Returns 0 where most are not rounded, or to different steps, or are noisier than that. Shapes: tracks (n_points,).
-    """
+    """The `rounding_noise` of most of a campaign's tracks where it dominates their noise and so holds for all, or 0."""
     # Below √2 errors of rounding, most of the noise is rounding.
     limit = math.sqrt(2) / math.sqrt(12)
     noises = sorted(
@@ -221,9 +214,7 @@ def _rounding_step(position_m: Floats) -> float:
 
 
 def rough_noise(position_m: Floats) -> float:
-    """Estimate the noise from the median third difference, as if it were white. Third differences of white noise have
-    variance 20σ², and the median of |x| is 0.6745 of a normal standard deviation. Shapes: position_m (n,).
-    """
+    """Noise by the median third difference, as if white; a median of |x| is 0.6745 of a normal standard deviation."""
     if position_m.size < 5:
         return 0.0
     third = np.diff(position_m, 3)
@@ -363,9 +354,7 @@ def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generat
 # neighbours on one cubic, and nothing is rejected there.
 
 HALF_WIDTH = 6  # Neighbours on either side (chosen)
-
 LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (chosen)
-
 FEWEST_POINTS = 2 * HALF_WIDTH + 1  # Fewest points of a window: the point and its neighbours (derived)
 
 
@@ -423,9 +412,7 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
 
 
 def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
-    """Estimate the standard deviation around each point, from so many on either side, by a running median, which is
-    0.6745 of it for normal noise. Shapes: distance_m (n_points,) → (n_points,).
-    """
+    """Standard deviation around each point by the running median of so many on either side. (n_points,) → same."""
     width = min(2 * half_width + 1, distance_m.size)
     view = np.median(np.lib.stride_tricks.sliding_window_view(distance_m, width), axis=1) / 0.6745
     middle = np.clip(np.arange(distance_m.size) - width // 2, 0, view.size - 1)
