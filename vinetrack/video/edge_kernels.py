@@ -69,9 +69,7 @@ def coverage_reach(length: float, blur: float) -> float:
 
 @njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def subpixel_index(place: float) -> tuple[int, int, float]:
-    """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
-    fraction; weight of entry j + 1.
-    """
+    """Whole part of the position of an edge, px; entry j of a coverage table below the rest; weight of entry j + 1."""
     whole = math.floor(place)
     fraction = (place - whole) * SUBPIXEL_STEPS
     j = min(int(fraction), SUBPIXEL_STEPS - 1)

@@ -43,9 +43,7 @@ NON_MARKING_DECODERS = frozenset(
 
 
 class Shot(NamedTuple):
-    """What is known of a picture: its time in ticks (NaN where unknown), whether it is `corrupt`, a `key` frame, or one
-    `between` others (a B frame), which is coded from later frames too.
-    """
+    """A picture's time in ticks, whether `corrupt`, a `key` frame, or `between` others (B), coded from later too."""
 
     tick: float
     corrupt: bool = False
@@ -280,10 +278,10 @@ def inspect_recording(path: Path | str) -> Recording:
         raise RecordingError(f"cannot be read: {error.strerror}", name=path.name) from None
     from vinetrack.video.images import CAMERA_READERS, inspect_images
 
-    if path.is_dir() or path.suffix.lower() in IMAGES:
-        return inspect_images(path)
     if size == 0:
         raise RecordingError("the file is empty", "copy it from the camera again", path.name)
+    if path.is_dir() or path.suffix.lower() in IMAGES:
+        return inspect_images(path)
     if path.suffix.lower() in CAMERA_FILES:
         return CAMERA_READERS[path.suffix.lower()](path)
     return _inspect_container(path)

@@ -313,8 +313,6 @@ def inspect_images(path: Path) -> Recording:
     """Read the facts of a folder of images or a TIFF stack from its first picture."""
     is_stack = not path.is_dir()
     files, numbers, notes = ((path,), (), ()) if is_stack else _numbered_files(path)
-    if is_stack and path.stat().st_size == 0:
-        raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     readable = next((p for p in map(_read_or_none, files[:3]) if p is not None), None)
     if readable is None:
         raise RecordingError(f"{files[0].name} is not an image that can be read", name=path.name)

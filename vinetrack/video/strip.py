@@ -69,9 +69,7 @@ class Positions:
 
 @dataclass(frozen=True)
 class Look:
-    """What a tracker looks at: pictures, shape (n_frames, height, width), the axis, the same pictures shrunk, and what
-    is known of the trial.
-    """
+    """What a tracker looks at: pictures, (n_frames, height, width), the axis, the pictures shrunk, facts of a trial."""
 
     luma: NDArray[Any]
     axis: Axis
@@ -205,9 +203,7 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
 
 
 def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
-    """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2); none
-    where there is hardly any.
-    """
+    """Whole pixels (x, y) of the background on both sides of a tube, shape (n, 2); none where there is hardly any."""
     # 14, 44: rows of background on either side, at least and at most (chosen)
     rows = half + BAND_GAP_PX + np.arange(int(np.clip(half, 14, 44)))
     along, across = np.meshgrid(np.arange(1.0, axis.length_px), np.concatenate([-rows, rows]), indexing="ij")

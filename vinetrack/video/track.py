@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -442,11 +443,9 @@ class Tracking:
 
 def track_recording(trial: Trial, axis: Axis | None = None) -> Tracking:
     """Track the leading edge of one recording, or the body where the travel ratio is 1, by the trial's own scale."""
-    if trial.video is None:
-        raise RecordingError("no recording is named", "fill in the column video", trial.name)
-    recording = inspect_recording(trial.video)
-    capture_fps = capture_rate(trial, recording)
-    return track_frames(read_event(recording, trial.frames_used), trial, capture_fps, axis)
+    recording = inspect_recording(trial.video or Path())
+    frames = read_event(recording, trial.frames_used)
+    return track_frames(frames, trial, capture_rate(trial, recording), axis)
 
 
 def track_frames(frames: Frames, trial: Trial, capture_fps: float, axis: Axis | None = None) -> Tracking:
@@ -505,9 +504,7 @@ def track_pixels(
 
 
 def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
-    """Rows of the decoded frames that the sheet allows, of the longest undamaged stretch, without odd ones at
-    either end; and notes on the others.
-    """
+    """Rows of the decoded frames to track: allowed, undamaged, not odd at either end; and notes on the others."""
     name = frames.recording.path.name
     if len(frames) < FEWEST_POINTS:
         raise RecordingError(too_few(len(frames)), "name a film or a folder of pictures", name)
