@@ -229,9 +229,8 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
 
 
 def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float) -> float:
-    """Jump between points i and i + 1 from many more points on either side, NaN where those are inconclusive. They are
-    conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few nearby
-    outliers made up is then gone.
+    """Jump between points i and i + 1 from many more points on either side, where an apparent one that a few outliers
+    made up is gone; NaN where these are inconclusive, as no cubic with a step follows them to within the noise.
     """
     first = max(i + 1 - WIDE_SIDE_POINTS, 0)
     near = slice(first, i + 1 + WIDE_SIDE_POINTS)

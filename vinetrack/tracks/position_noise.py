@@ -567,9 +567,7 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
 
 
 def _by_speed(differences: Sequence[_Differences]) -> tuple[float, NoiseShape] | None:
-    """−2 ln L of noise with the most likely τ of all trials together and s of each, and the standard deviations, by
-    the multiplicative updates of `_whittle`.
-    """
+    """−2 ln L of noise with the most likely τ and s of each trial, and its sd, by the updates of `_whittle`."""
     trial = np.repeat(np.arange(len(differences)), [np.count_nonzero(part.use) for part in differences])
     square = np.concatenate([part.distance_m[part.use] for part in differences]) ** 2
     speed_square = np.concatenate([part.speed_m_s[part.use] for part in differences]) ** 2
