@@ -73,9 +73,8 @@ def _shrunk(picture: NDArray[Any]) -> NDArray[Any]:
 
 
 class SmallPictures:
-    """The frames of a recording, shrunk once for every step that looks for its axis. `frames`, shape (n_frames, height,
-    width), are in grey levels of 255, corrected for flicker; `factor` is the factor by which they were shrunk and
-    `shape` their original height and width, px.
+    """The frames of a recording, shrunk once by a `factor` for all that looks for its axis. `frames`, (n_frames,
+    height, width), are in grey levels of 255, without flicker; `shape` is their original height and width, px.
     """
 
     def __init__(self, luma: NDArray[Any]) -> None:
@@ -116,9 +115,7 @@ class SmallPictures:
 
 @njit(nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first picture after the largest step of each pixel's mean brightness, and the power of that step,
-    (n_pixels,) each. Shapes: pictures (n, n_pixels).
-    """
+    """Find the first picture after the largest step of each pixel's brightness, and its power: (n, n_pixels) → each."""
     n, pixels = pictures.shape
     best, step_frame = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
     block = 512
@@ -236,9 +233,8 @@ def collecting_path(score: NDArray[Any]) -> Floats:
 
 
 def column_after_leap(path: Floats) -> int:
-    """Return the column at which growth begins if the path leaps at its start. At release the tail jerks inside the
-    film that already stands there: its columns change, but no front passes. No front is three times as fast in its
-    first frames as in those that follow. Shapes: path (n_frames,).
+    """Return the column at which growth begins if the path leaps at its start: at release the tail jerks inside the
+    film that stands there, and no front is three times as fast in its first frames as later. Shapes: path (n_frames,).
     """
     steps = np.diff(path)
     if not np.any(steps > 0):
@@ -265,9 +261,7 @@ MARGIN_FRAMES = 40  # Frames added at either end of the event (chosen)
 
 
 def read_event(recording: Recording, frame_range: tuple[int, int] | None = None) -> Frames:
-    """Decode the frames that show the event, or those of a range; the whole recording if it is small, if its frames
-    cannot be read one by one, or if no event stands out.
-    """
+    """Decode the frames of the event, or of a range; all if it is small, not read one by one or no event stands out."""
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     if (recording.declared_frames or 0) * recording.width * recording.height * pixel_bytes <= MAX_BYTES_WHOLE:
         return read_frames(recording)
@@ -541,9 +535,8 @@ def along_axis(small: SmallPictures, pixels: Pixels, axis: Axis) -> Pixels:
 
 
 def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
-    """Move and turn a given straight axis onto the line of what moves within its width, and make it as wide as that.
-    The ends keep their places along the axis: only the position across is corrected, by up to half of `given.width_px`
-    and MOST_TURN_DEG. Of several bodies within the width, the one that moves nearer to the axis is preferred.
+    """Move and turn a given straight axis onto the line of what moves within its width, by at most half of that and
+    MOST_TURN_DEG, and make it as wide as that; of several bodies the one nearer to the axis is preferred.
     """
     reach, length = max(0.5 * given.width_px / small.factor, 3.0), given.length_px / small.factor
     changed = along_axis(small, small.changed, given)
@@ -600,9 +593,8 @@ def _line_through_pairs(small: SmallPictures, pixels: Pixels, likely: Floats) ->
 def _line_through(
     pixels: Pixels, likely: Floats, tried: list[tuple[float, Floats]], band: float, first_band: float, most_band: float
 ) -> _Line:
-    """The line along which most change is collected in order; an empty one where there is none. The best of those that
-    are `tried` (direction and point), by what is `likely` within `band`, is refined until its band no longer widens,
-    which reaches at most `most_band` to either side.
+    """The line along which most change is collected in order, or an empty one. The best of those `tried` (direction and
+    point), by what is `likely` within `band`, is refined until its band, at most `most_band`, no longer widens.
     """
     places, collected = np.column_stack([pixels.x, pixels.y]), []
     for angle, middle in tried:
@@ -712,9 +704,7 @@ def find_curve(small: SmallPictures) -> Axis | None:
         axis = axis_through(through, axis.width_px)
     except RecordingError:
         return None
-    if not axis.bends or axis_problem(axis, axis.width_px / 2, size):
-        return None
-    return axis
+    return None if axis_problem(axis, axis.width_px / 2, size) else axis
 
 
 # ------------------------------------------------------------------------------

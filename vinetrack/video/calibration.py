@@ -127,9 +127,7 @@ def _dictionary(name: str) -> Any:
 def _best_layout(
     corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: Any
 ) -> tuple[float, float, Any]:
-    """Share of the markers that lie where a board has them, their size (mm) beside squares of `square_mm`, and its
-    layout: as OpenCV prints it from version 4.6, or as before.
-    """
+    """Share of the markers that lie where a board has them, their size (mm), and its layout: OpenCV 4.6, or before."""
     found = []
     for legacy in (False, True):
         layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
@@ -426,9 +424,7 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 
 
 def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
-    """Calibrate from the first picture in which a target can be read: more add less than the error that all corners
-    share. Shapes: pictures (height, width), grey levels.
-    """
+    """Calibrate from the first picture in which a target can be read: more add less than what all corners share."""
     complaint = "it holds no picture that can be read"
     for picture in pictures:
         try:
@@ -469,9 +465,7 @@ def calibrate_pictures(pictures: Iterable[NDArray[Any]], board: Charuco | Checke
 
 
 def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
-    """Move, drop or confirm points of a track. A moved point has the error of a click; a dropped one is `rejected`; a
-    confirmed one is no longer doubtful.
-    """
+    """Move points of a track, which then have the error of a click, drop them, or confirm them as not doubtful."""
     if not corrections:
         return track
     edge, sigma, slow = track.edge_px.copy(), track.lead_position_sigma_m.copy(), track.lead_position_systematic_m

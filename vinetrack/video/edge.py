@@ -190,9 +190,8 @@ ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (cho
 
 
 def find_shape(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
-    """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur. Both come from
-    the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
-    them. Shapes: fit (n_frames, 5).
+    """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur, both from the
+    core frames with less motion blur. Shapes: fit (n_frames, 5).
     """
     largest_lag_step_px = 4.0  # Largest change of a row's lag in one round (chosen)
     core = core_frames(state, fit)
@@ -306,9 +305,8 @@ LEAST_AMPLITUDE = 0.5
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools, cost: NDArray[np.float32]) -> Floats:
     """Replace fits that break the motion or hardly fit by the best ones where the motion leads, unless the pixels
     between the two, by the `cost` of an edge at each column, tell that the fit is right: frames are missing then, or
-    its neighbour is astray. Goes from the middle of the motion backwards and forwards. The edge never retreats, and a
-    step is at most 1.3 times its neighbour or 1.5 px more. Shapes: fit (n_frames, 5); chosen (n_frames,); cost
-    (n_frames, n_along) → (n_frames, 5).
+    its neighbour is astray. Goes from the middle of the motion backwards and forwards. The edge never retreats.
+    Shapes: fit (n_frames, 5); chosen (n_frames,); cost (n_frames, n_along) → (n_frames, 5).
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -445,8 +443,8 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 # look like background.
 #
 # The first path knows neither, and takes the last frames for film and the first for background. An object that stood in
-# front at the start misleads it, and it starts up to three frames late and ends up to three frames early, because
-# several frames are averaged at either end.
+# front at the start misleads it, and the frames averaged at either end make it start late and end early. A late start
+# is better than an early one: neighbours then stand in for the background.
 
 
 # Power of a column's change over that of its noise from which it counts as changed; length of a run of columns, px, of
@@ -455,10 +453,8 @@ LEAST_CHANGE, RUN_PX = 30.0, 9
 
 
 def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
-    """Find the initial path of the front and the columns that it leaves permanently changed. Returns that path, with
-    film and background for a straight tip and a typical blur; and the first column of those that changed in runs, the
-    one behind the last, and that in the last frame, which may be further on. A late beginning is better than an early
-    one: neighbours then stand in for the background.
+    """Find the initial path of the front, with film and background for a straight tip and a typical blur; and the first
+    column of those that changed in runs, the one behind the last, and that in the last frame, which may be further on.
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
     last, first = (np.sort(strip.brightness(frames), axis=0)[END_FRAMES // 2] for frames in ends)
@@ -581,9 +577,8 @@ class Outline:
 
 
 def outline(strip: Strip, parts: int) -> Outline:
-    """Measure the centreline and width of the tube that the front leaves behind. The contrast of each row between film
-    and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
-    degrees off and would cut the tube obliquely.
+    """Measure the centreline and width of the tube that the front leaves, by the contrast of each row between film and
+    background in `parts` stretches along the axis: a given axis that is two degrees off cuts the tube obliquely.
     """
     state, passed = initial_front_path(strip)
     film, background = state.appearance[:2, :, passed[0] : passed[1]]
@@ -627,9 +622,8 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
-    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
-    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
-    passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
+    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too:
+    None where no single front passes along the axis, or along the middle of what it leaves, which is then no tube.
     """
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
@@ -657,9 +651,8 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
 
 
 def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
-    """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
-    keep their places along it: only the position across is corrected. It stays as it is where the tube's middle is no
-    path that a strip can be cut along.
+    """Move an axis across onto the middle of a tube, with the tube's width, and measure how far that is. It stays as it
+    is where the tube's middle is no path that a strip can be cut along.
     """
     place, middle = tube.places_px, tube.middles_px
     if axis.bends:
@@ -685,10 +678,8 @@ def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
 def _path_by_appearance(
     strip: Strip, appearance: NDArray[np.float32], passed: tuple[int, int, int]
 ) -> tuple[Floats, NDArray[np.float32]]:
-    """Find the monotone path that best divides film from background between the columns that it passes, and what an
-    edge costs at each column of a frame, (n_frames, n_along). Distances from either, in standard deviations of a pixel
-    and a tenth of the contrast together, are clipped, so that a door, a payload flying ahead or a reflection cannot
-    capture it.
+    """Find the monotone path that best divides film from background between the columns that it passes, and the cost
+    of an edge by frame and column. Distances from either are clipped: no door, payload or reflection captures it.
     """
     contrast = np.abs(appearance[0] - appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise

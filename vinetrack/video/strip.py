@@ -180,9 +180,7 @@ def camera_unit(luma: NDArray[Any]) -> float:
 
 
 def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats, Floats, bool]:
-    """Flicker and shake of every frame. Returns scale and offset that correct flicker, shape (n_frames,) each, shift in
-    x and y, shape (n_frames, 2), px, and whether the camera shook. Shapes: luma (n_frames, height, width).
-    """
+    """Scale and offset of every frame that correct flicker, its shift, (n_frames, 2), and whether the camera shook."""
     n, unit = len(luma), camera_unit(luma)
     shift, shaken = np.zeros((n, 2)), False
     places = _beside(axis, half, luma.shape[1:])
@@ -257,8 +255,7 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
     The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
     zero, the shift where the background has no texture, and the gain where it is black. Returns gain, level, shift in x
     and y of every frame, shape (3, n_frames, 4), and the standard errors of the shift, shape (3, n_frames, 2): by the
-    first half of the pixels, by the second, and by all. Shapes: luma (n_frames, height, width); places (n_pixels, 2);
-    basis (4, n_pixels); shift_px (n_frames, 2).
+    first half of the pixels, by the second, and by all. Shapes: places (n_pixels, 2); basis (4, n_pixels).
     """
     level = float(np.abs(basis[0]).mean()) + 1e-9
     ridge = np.diag([1e-6 * level**2, 25.0 * basis.shape[1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])

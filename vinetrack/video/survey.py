@@ -241,9 +241,7 @@ def _stated_facts(
 
 
 def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
-    """List the sizes in the picture that contradict the sheet: warnings, or errors beyond a factor of ERROR_FACTOR. A
-    body that moves as a whole has no tube; `compare_sizes: no` in the sheet skips the comparison.
-    """
+    """Sizes in the picture that contradict the sheet: warnings, or errors beyond ERROR_FACTOR; none of a body."""
     if trial.travel_ratio == 1 or not trial.compare_sizes:
         return []
     diameter_mm, length_mm = 1e3 * trial.diameter_m, 1e3 * trial.length_m
@@ -299,9 +297,7 @@ def _differs(code: str, column: str, stated: float, seen: str, ratio: float, rem
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
-    `down` is the growth angle from straight down as the sheet states it: no picture shows it.
-    """
+    """A line a recording: sizes in the picture next to the sheet's, and the angle that no picture shows, `down`."""
     rows = []
     for fact, trial in zip(facts, trials, strict=True):
         ends = () if fact.axis is None else (*fact.axis.from_px, *fact.axis.to_px)

@@ -250,9 +250,7 @@ LEAST_PART = 0.5  # Least part of the frames that must follow each other without
 
 
 def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
-    """Frames to be tracked: all that are allowed where none is damaged, else the longest stretch without damage.
-    Shapes: allowed (n_frames,) → (n_frames,).
-    """
+    """Frames to be tracked: all that are allowed where none is damaged, else the longest stretch without damage."""
     damaged = frames.damaged & allowed
     # Lost frames, within the recording or at its end, count as damage.
     span = 1 + int(np.ptp(frames.slot[allowed]))
@@ -376,9 +374,7 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
 
 @dataclass(frozen=True)
 class Ending:
-    """How an edge ends: its way from standstill to standstill, and until the last frame where it still moves there, px
-    (NaN otherwise); and a `remark` on where it stopped.
-    """
+    """How an edge ends: its way to standstill, or to the last frame if it still moves, px or NaN; where it stops."""
 
     grown_px: float = math.nan
     truncated_px: float = math.nan
@@ -468,7 +464,7 @@ def track_pixels(
     axis_given = axis is not None
     try:
         small = SmallPictures(luma)
-        axis = locate_axis(luma, small, axis, trial, diameter_px)
+        axis = locate_axis(small, axis, trial, diameter_px)
         followed = follow(Look(luma, axis, small, trial.travel_ratio, exposure_s * capture_fps))
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy or NO_GROWTH, name) from error
@@ -557,22 +553,18 @@ def _notes(
     return notes, ending
 
 
-def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, trial: Trial, diameter_px: float) -> Axis:
+def locate_axis(small: SmallPictures, axis: Axis | None, trial: Trial, diameter_px: float) -> Axis:
     """Find the growth axis, or give a known one a width and centre it on the motion."""
-    given = axis is not None
     if axis is None:
-        axis = find_growth_axis(small) if trial.travel_ratio == 2 else find_axis(small, grows=False)
+        return find_growth_axis(small) if trial.travel_ratio == 2 else find_axis(small, grows=False)
     # The width of the axis, else the sheet's diameter by the scale, else a fifth of the axis
     widths_px = (axis.width_px, diameter_px, 0.2 * axis.length_px)
     width_px = next(width for width in widths_px if np.isfinite(width))
-    if not given:
-        return replace(axis, width_px=width_px)
     # A margin for an axis a few degrees off (derived); it is centred on the motion, here or by the tracker of tubes.
     wide_px = width_px + 0.08 * axis.length_px
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
-        size_px = luma.shape[2], luma.shape[1]
-        if complaint := axis_problem(axis, width_px / 2 if width_known else math.nan, size_px):
+        if complaint := axis_problem(axis, width_px / 2 if width_known else math.nan, small.shape[::-1]):
             raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
         wide_px = min(wide_px, 2 * axis.largest_half_px)
         return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
