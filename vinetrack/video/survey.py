@@ -17,6 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from vinetrack.core.problems import Problem, confirmed
@@ -154,12 +155,7 @@ def is_calibration(folder: Path) -> bool:
 
 def _is_stack(path: Path) -> bool:
     """Whether a TIFF holds as many pictures as a recording needs."""
-    from PIL import Image
-
-    if path.suffix.lower() in (".tif", ".tiff"):
-        with contextlib.suppress(OSError), Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= FEWEST_POINTS
-    return False
+    return path.suffix.lower() in (".tif", ".tiff") and cv2.imcount(str(path)) >= FEWEST_POINTS
 
 
 def natural_order(text: str) -> list[Any]:
