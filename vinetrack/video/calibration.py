@@ -273,16 +273,14 @@ class PlaneMap:
 
     def path_rel_sigma(self, places_px: Floats) -> float:
         """Relative standard error of the length of a path in the plane, from the covariance; its places are (n, 2)."""
-        gradient = np.zeros(self.parameters.size)
-        steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
-        for k, step in enumerate(steps):
-            change = np.zeros(self.parameters.size)
-            change[k] = step
-            moved = (self._plane_m(self.parameters + sign * change, places_px) for sign in (-1, 1))
-            lower, upper = (length_along(path_m)[-1] for path_m in moved)
-            gradient[k] = (upper - lower) / (2 * step)
+
+        def length_m(parameters: Floats) -> float:
+            return float(length_along(self._plane_m(parameters, places_px))[-1])
+
+        best, steps = self.parameters, np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9)
+        gradient = np.array([length_m(best + step) - length_m(best - step) for step in np.diag(steps)]) / (2 * steps)
         variance = float(gradient @ self.covariance @ gradient)
-        return float(np.sqrt(max(variance, 0.0)) / length_along(self.plane_m(places_px))[-1])
+        return math.sqrt(max(variance, 0.0)) / length_m(best)
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
         until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12

@@ -454,8 +454,7 @@ def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tupl
 # ------------------------------------------------------------------------------
 # Reading frames stored as the sensor gave them: 8 to 16 bits, packed or not, one frame at a time.
 #
-# High-speed cameras write such files with headers of their own (`images`). Only the current frame is held in
-# memory.
+# High-speed cameras write such files with headers of their own (`images`). Only one frame is held in memory.
 
 # Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064
 _TABLE_STEPS = (

@@ -123,10 +123,8 @@ def cut_strip(
     # Noise of a pixel from differences of neighbouring frames, grey levels. Medians over pixels, since motion affects
     # few of them; at least 1, since compression freezes a picture at rest, while moving pixels are never known better.
     step = max(1, len(values) // 40)
-    first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
-    n = min(len(first), len(second))
-    change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
-    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
+    first, second = (of_pair[::step, ::4, ::4].astype(np.float32) for of_pair in (values[:-1], values[1:]))
+    medians = np.median(np.abs(second - first), axis=(1, 2)) if len(first) else np.zeros(1)
     noise = max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
     return Strip(values, scale, offset, shift, noise, axis, stabilised)
 
