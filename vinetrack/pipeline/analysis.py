@@ -245,9 +245,7 @@ def draw_trial(results: Results, trial: Trial | None, name: str, windows: Sequen
 
 
 def fit_damping(job: Job) -> list[str]:
-    """Gather the trials; fit the damping law and its scaling with size, and write `damping.json` and `scaling.json`,
-    and `damping_points.csv` with the reason of each point that the law leaves out.
-    """
+    """Gather the trials, fit the damping law and its scaling with size; write both, and why points are left out."""
     table, points = gather(job.experiment, job.results, job.settings)
     results, settings = Results(job.results), job.settings.damping
     law = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
@@ -288,9 +286,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple
 
 
 def fit_and_diagnose(job: Job) -> list[str]:
-    """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks. A
-    diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
-    """
+    """Do the stage `model`. A diagnosis that fails does not stop the run: `diagnosis.json` then states the reason."""
     lines, results = fit_damping(job), Results(job.results)
     job.say("fitting the model")
     fitted, pairs, motions = fit_model(job)

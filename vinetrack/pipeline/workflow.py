@@ -422,9 +422,7 @@ def or_exit(function: Callable[..., Any], *given: Any) -> Any:
 
 
 def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
-    """Print the path of the report at the end of this process, if Snakemake ran jobs or found nothing to do, and the
-    report is newer than all inputs; not after a listing, a dry run, or a run that failed.
-    """
+    """Print the path of a report newer than its inputs; not after a listing, a dry run, or a run that failed."""
     path = plan.results / "report.html"
     ran = workflow.execution_settings is not None and not workflow.dryrun and path.exists()
     if ran and path.stat().st_mtime >= Path(plan.version_file).stat().st_mtime:
