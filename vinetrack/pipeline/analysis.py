@@ -24,7 +24,7 @@ import pandas as pd
 
 from vinetrack.core.problems import INTERNAL_ERROR, InputError, UserError, confirmed, remark
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.tables import is_disk_full, write_csv, write_json, write_text
+from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json, write_text
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
@@ -44,7 +44,7 @@ from vinetrack.experiment.folder import SETTINGS, Experiment
 from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
 from vinetrack.figures.registry import features
-from vinetrack.figures.style import blank
+from vinetrack.figures.style import blank, render
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
 from vinetrack.inference.fit_summary import FitSummary, summary_of
@@ -60,7 +60,7 @@ from vinetrack.kinematics.summary import (
 )
 from vinetrack.narrative.diagnosis_text import damping_headline, failures_told, proposal_lines
 from vinetrack.narrative.verdict_text import verdict_sentence, verdict_table
-from vinetrack.pipeline.workflow import Job, Kept, Say, map_unordered
+from vinetrack.pipeline.workflow import Job, Kept, Say, code_hash, map_unordered
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results import (
     KINEMATICS_COLUMNS,
@@ -222,10 +222,16 @@ def _draw(
             return blank(f"{name}: {reason}")
         return draw_strip(name, measurement.tracking, measurement.m_per_px, unit)
 
-    kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, motion)
+    def write(draw: Callable[[], Figure], path: Callable[..., Path], *inputs: object) -> None:
+        state = code_hash(), settings.dpi, settings.formats, inputs
+        pictures = kept.made("figure", state, lambda: render(draw(), settings.formats, settings.dpi))
+        for form, data in pictures.items():
+            write_bytes(path(name, suffix=f".{form}"), data)
+
+    write(motion, results.trial_figure, "trial", title, ratio, *shown)
     if trial is not None and trial.video is not None:
         seen = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections, unit)
-        kept.figure(("strip", name, *seen), partial(results.strip_figure, name), settings, strip)
+        write(strip, results.strip_figure, "strip", name, *seen)
 
 
 def _described(name: str, trial: Trial | None) -> tuple[str, float]:

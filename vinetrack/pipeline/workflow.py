@@ -36,11 +36,9 @@ from vinetrack.core.tables import write_bytes, write_text
 from vinetrack.results import CLAIM_FILE, claim, locked, refuse_shared_results
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from vinetrack.core.records import Track, Trial
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import FigureSettings, RunSettings
+    from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.survey import Keep
     from vinetrack.video.track import Tracking
 
@@ -225,21 +223,6 @@ class Kept:
                 write_bytes(path, zlib.compress(content, 1))
         found: Answer = pickle.loads(content)
         return found
-
-    def figure(
-        self, inputs: tuple[object, ...], path: Callable[..., Path], settings: FigureSettings,
-        draw: Callable[[], Figure],
-    ) -> None:  # fmt: skip
-        """Write a figure in every format, kept for these inputs or drawn; `path` gives the path for a suffix."""
-
-        def rendered() -> dict[str, bytes]:
-            from vinetrack.figures.style import render
-
-            return render(draw(), settings.formats, settings.dpi)
-
-        state = code_hash(), settings.dpi, settings.formats, inputs
-        for form, data in self.made("figure", state, rendered).items():
-            write_bytes(path(suffix=f".{form}"), data)
 
     def forget(self) -> None:
         """Drop what no run has asked for in a long time."""
