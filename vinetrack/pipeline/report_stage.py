@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import vinetrack.results as layout
-from vinetrack.core.problems import INTERNAL_ERROR, UserError, remark
+from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.core.process import table
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
@@ -162,12 +162,10 @@ def track_file(
             raise UserError(f"{file}: states no `calibration:`; give an experiment.yaml that does, or --mm-per-px")
     recording = inspect_recording(path)
     rate = capture_fps if recording.capture_fps is None else recording.capture_fps
-    if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
-        raise UserError(str(remark("other_rate_in_file", file=path.name, given=capture_fps, stated=rate)))
     trial = Trial(
         name=path.stem,
         video=recording.path,
-        capture_fps=rate if math.isfinite(rate) else 1.0,
+        capture_fps=capture_fps if math.isfinite(rate) else 1.0,
         capture_fps_is_playback=True,
         exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
         # Without a scale, the unit of length is one pixel.
