@@ -23,9 +23,9 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.motion_figures import TRACKED, ClipView, draw_strip
 from vinetrack.figures.style import SKY, VERMILLION
-from vinetrack.pipeline import report_stage
+from vinetrack.pipeline import analysis, report_stage
 from vinetrack.pipeline.analysis import analyse_trials
-from vinetrack.pipeline.workflow import Job, Kept, map_unordered
+from vinetrack.pipeline.workflow import Job, map_unordered
 from vinetrack.report import build as clips
 from vinetrack.results import Results, read_result
 from vinetrack.video import survey
@@ -72,7 +72,7 @@ def again(tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> list[s
     track_pixels = survey.track_pixels
     with monkeypatch.context() as changed:
         changed.setattr(survey, "track_pixels", track)
-        changed.setattr(Kept, "figure", lambda *_: None)
+        changed.setattr(analysis, "_draw", lambda *_: None)
         analyse_trials(Job(read_experiment(folder), results, run_settings({})))
     return films
 
