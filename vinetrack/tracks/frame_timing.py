@@ -47,20 +47,15 @@ class _Jump(NamedTuple):
 
 
 def correct_frames(track: Track) -> Track:
-    """Flag repeated frames and gaps of a track, and correct its times."""
-    return reject_outliers(_correct_timing(track))
-
-
-def _correct_timing(track: Track) -> Track:
-    """Flag repeated frames and gaps, and correct the times."""
+    """Flag repeated frames and gaps of a track, correct its times, and reject its outliers."""
     spacing = np.diff(track.time_s)
     if track.time_s.size < 6 or not np.all(spacing > 0):
-        return track
+        return reject_outliers(track)
     step_s = float(np.median(spacing))
     frames = spacing / step_s
     # Spacings must be whole numbers of frames to within 5 %.
     if np.any(np.abs(frames - np.rint(frames)) > 0.05 * np.maximum(np.rint(frames), 1.0)):
-        return track
+        return reject_outliers(track)
     out = track
     # `gap` on the first row after each spacing of two frames or more that nothing has marked yet
     for before in np.flatnonzero((np.rint(frames) > 1) & ~with_flag(track.flag[1:], "gap")):
@@ -81,7 +76,7 @@ def _correct_timing(track: Track) -> Track:
             note = f"{_frames_are(frames_late)} missing before {at_s:.5g} s (the step there is too long): later times "
             note += "moved on"
         out = replace(out, time_s=time_s).flagged([row], "duplicate" if is_copy else "gap;retimed", note)
-    return out
+    return reject_outliers(out)
 
 
 def frames_surely_missing(track: Track) -> bool:
