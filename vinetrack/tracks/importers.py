@@ -74,9 +74,7 @@ def new_track(time_s: Floats, lead_position_m: Floats, notes: Sequence[str], **k
 
 
 def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
-    """Times of evenly spaced frames before they were rounded, and a sentence that says so. Returns time_s (unchanged
-    where they are not rounded, or not evenly spaced), note (blank where nothing was done). Shapes: time_s (n,) → (n,).
-    """
+    """Times of evenly spaced frames before they were rounded, and a note; or the times as they are, and a blank."""
     if time_s.size < 8 or not np.isfinite(time_s).all():
         return time_s, ""
     scaled = time_s * 10.0 ** np.arange(7)[:, None]  # with more decimals a time does not count as rounded
@@ -415,9 +413,7 @@ def _factor(unit: str, si: str) -> float:
 
 
 def _project_on_axis(points: Floats) -> tuple[Floats, str]:
-    """Positions, (n,), along the principal axis of the motion, with a net displacement that is not negative, and a
-    sentence saying so, blank where nothing was done; NaN rows stay NaN. Shapes: points (n, 1 to 3).
-    """
+    """Positions along the principal axis of the motion, forwards, (n,), and a note. Shapes: points (n, 1 to 3)."""
     known = np.all(np.isfinite(points), axis=1)
     if np.max(np.abs(points[known])) > LARGEST_NUMBER:
         raise InputError("holds a position too large to be one", "correct it")

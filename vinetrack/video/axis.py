@@ -276,9 +276,7 @@ def read_event(recording: Recording, frame_range: tuple[int, int] | None = None)
 
 
 def event_range(pictures: list[NDArray[Any]], numbers: Indices, count: int) -> tuple[int, int] | None:
-    """Return the first and last frame of the event, both and a margin included, from samples of the recording; None if
-    nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
-    """
+    """First and last frame of the event, with a margin, from samples of a recording; None if nothing changes."""
     fewest = 8  # Samples, and pixels that must have changed (chosen)
     time = SmallPictures(np.stack(pictures)).changed.time.astype(int) if len(pictures) >= fewest else np.zeros(0, int)
     if len(time) < fewest:

@@ -168,9 +168,7 @@ def _pixels(
 
 
 def camera_unit(luma: NDArray[Any]) -> float:
-    """Return the number of grey levels of 255 per unit of the camera's values. Shapes: luma (n_frames, height, width).
-    White is the brightest value but for one pixel in ten thousand, which may be hot.
-    """
+    """Grey levels of 255 per unit of the camera's values; white is the brightest but for one hot pixel in 10,000."""
     if luma.dtype == np.uint8:
         return 1.0
     top = float(np.quantile(luma[:: max(1, len(luma) // 8), ::2, ::2], 0.9999))

@@ -41,9 +41,7 @@ from vinetrack.video.track import Tracking, in_metres, too_few, track_pixels
 
 @dataclass(frozen=True)
 class Measurement:
-    """A tracked recording with its scale: the mean along the growth axis, and its relative standard error, NaN where
-    unknown, which all points share, and which is kept apart from the random error of each.
-    """
+    """A tracked recording with its scale: the mean along the axis, and its relative error, one for all points."""
 
     tracking: Tracking
     m_per_px: float
