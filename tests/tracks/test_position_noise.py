@@ -8,14 +8,14 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter, savgol_filter
+from scipy.signal import butter, filtfilt, lfilter, savgol_filter
 from vine_truth import CAPTURE_FPS, ar1, record, scaled
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.tracks import position_noise as module
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
-from vinetrack.tracks.position_noise import detect_smoothing, noise_shape, position_noise, reject_outliers
+from vinetrack.tracks.position_noise import detect_smoothing, low_passed, noise_shape, position_noise, reject_outliers
 
 FRAMES = np.arange(300) / 1069
 NOISE_M = 6e-5
@@ -201,11 +201,13 @@ def test_rounded_positions_have_no_outliers_or_missing_frames(step_m, every):
         assert not correct_frames(reject_outliers(plain_track(track.time_s[::every], position_m))).notes
 
 
-def smooth_tracks(seed: int, rho: float = 0.0, smooth=lambda y: y) -> list[tuple[Trial, Track]]:
-    """Eight, from rest at 20 ms, at up to 3 m/s."""
-    draw, since = np.random.default_rng(seed), np.clip(TIME_S - 0.02, 0.0, None)
+def smooth_tracks(
+    seed: int, rho: float = 0.0, smooth=lambda y: y, rest_s: float = 0.02, noise_m: float = 1e-4
+) -> list[tuple[Trial, Track]]:
+    """Eight, from rest until then, at up to 3 m/s."""
+    draw, since = np.random.default_rng(seed), np.clip(TIME_S - rest_s, 0.0, None)
     grown_m = 3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01)))
-    noisy = [grown_m + module.ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(8)]
+    noisy = [grown_m + module.ar1_noise(TIME_S.size, noise_m, rho, draw) for _ in range(8)]
     return [(TRIAL, as_track(TIME_S, smooth(y))) for y in noisy]
 
 
@@ -221,6 +223,17 @@ def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree, 
     found = detect_smoothing(smooth_tracks(352 + degree // 2, smooth=polynomial if degree else average))
     assert (found.window, found.degree) == (frames, degree)
     assert 1 < found.decimation < frames if degree else found.decimation == frames
+
+
+@pytest.mark.parametrize(("order", "cutoff"), [(2, 0.2), (4, 0.1), (2, 0.1)])
+@pytest.mark.parametrize("decimals", [5, 12])
+def test_a_low_pass_is_found_with_its_cutoff_from_positions_at_rest(order, cutoff, decimals):
+    """Others than it are not: noise that is correlated, rounded, or hardly there."""
+    b, a = butter(order, 2 * cutoff)
+    told = low_passed(smooth_tracks(356, smooth=lambda y: np.round(filtfilt(b, a, y), decimals), rest_s=0.06))
+    assert told.facts["cutoff"] == pytest.approx(cutoff, rel=0.35)
+    for rho, noise_m in ((0.0, 1e-4), (0.6, 1e-5), (0.9, 1e-4), (0.0, 1e-7)):
+        assert not low_passed(smooth_tracks(357, rho, lambda y: np.round(y, decimals), 0.06, noise_m))
 
 
 def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path):

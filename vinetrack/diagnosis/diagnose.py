@@ -53,7 +53,7 @@ from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import relative_residuals
 from vinetrack.tracks.frame_timing import correct_frames, ends_short, frames_surely_missing, longer_than_stated
-from vinetrack.tracks.position_noise import rejected_points_note
+from vinetrack.tracks.position_noise import low_passed, rejected_points_note
 
 
 @in_one_blas_thread
@@ -118,7 +118,7 @@ def diagnose(
             told.append(remark("odd_trials", odd=odd, names=names, others=len(others.fit.trials)))
             result = replace(others, odd_trials=names)
     result = with_lost_frames(result, dropped)
-    told += [longer_than_stated(pairs), ends_short(pairs)]
+    told += [longer_than_stated(pairs), ends_short(pairs), low_passed(pairs)]
     if far_off := _far_off(result.fits[-1]):
         told.append(remark("far_off", names=list(far_off), percent=100 * max(far_off.values())))
     outliers = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})

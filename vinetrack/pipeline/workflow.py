@@ -447,7 +447,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import ends_short, longer_than_stated, mean_speed
     from vinetrack.tracks.importers import track_lines
-    from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing
+    from vinetrack.tracks.position_noise import common_rounding_noise, detect_smoothing, low_passed
     from vinetrack.video.axis import askew_trials, axis_entry
     from vinetrack.video.survey import Surveyor, facts_entry, facts_rows, in_no_row
 
@@ -486,6 +486,8 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in tracks])
     if smoothing := detect_smoothing(tracks, rounding_m):
         notes.append(str(remark("smoothed", how=str(smoothing), frames=smoothing.decimation)))
+    elif filtered := low_passed(tracks):
+        notes.append(str(filtered))
     if rounding_m > 0:
         notes.append(str(remark("rounded", step_m=math.sqrt(12) * rounding_m)))
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), (*lines, *track_lines(tracks)), tuple(notes))
