@@ -248,7 +248,7 @@ def _ranking(step: Round) -> list[str]:
             ("* " if candidate.in_answer_set else "  ") + candidate.effect,
             f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
             f"{candidate.sigma:.1f}",
-            estimates_text(candidate),
+            size if len(size := estimates_text(candidate)) <= 64 else f"{size[:64].rpartition(', ')[0]}, …",
             str(candidate.reason) or candidate.status,
         )
         for candidate in testable[:8]  # as many as the terminal shows (chosen)
