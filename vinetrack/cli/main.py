@@ -308,17 +308,18 @@ def _diagnose(target: Path, experiment: Path | None, json: Path | None, report: 
     from vinetrack.diagnosis.diagnose import diagnose
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
-    from vinetrack.kinematics.summary import look_at_motions
-    from vinetrack.pipeline.analysis import diagnosed, diagnosis_content, write_diagnosis
+    from vinetrack.pipeline.analysis import diagnosed, diagnosis_content, fit_model, write_diagnosis
 
     results = layout.Results(target)
     if results.provenance.exists():
         source = layout.read_source_experiment(target, experiment)
-        pairs = layout.measured_trials(source, results)
-        diagnosis = diagnosed(source, results, pairs, report)
-        if json is None:
+        if json is None:  # with the fit that it is of: model and sheet may have changed since the run
             settings = run_settings(layout.read_json(results.provenance)["settings"])
-            write_diagnosis(results, diagnosis, partial(look_at_motions, pairs, settings), settings)
+            fitted, pairs, motions = fit_model(workflow.Job(source, target, settings, say=report))
+            diagnosis = diagnosed(source, results, pairs, report, fitted)
+            write_diagnosis(results, diagnosis, lambda: motions, settings)
+        else:
+            diagnosis = diagnosed(source, results, layout.measured_trials(source, results), report)
         return [str(diagnosis).replace("RESULTS", str(target))], diagnosis_content(diagnosis)
     read = read_experiment(workflow.find_experiment(target))
     if read.trials and all(trial.track is None for trial in read.trials):

@@ -128,16 +128,18 @@ def diagnose(
 
 def _far_off(fit: Fit) -> dict[str, float]:
     """Trials that a model misses though it describes the others, and by which part of their growth: by far in itself,
-    or far more than by their noise and than it misses the others. None where half of the trials are missed.
+    or far more than by their noise and than it misses the others. None where half of the trials are missed, or two of a
+    condition, of which physics is the cause.
     """
     missed, data = relative_residuals(fit.predictor, fit.solution), fit.predictor.data
     noises = [trial_data.noise_m / max(float(np.ptp(trial_data.lead_position_m)), 1e-9) for trial_data in data]
-    # 5, 3: times the median of all trials, and times its own noise, from which a trial is far off (chosen)
-    beside_others = (missed > 5 * np.median(missed)) & (missed > 3 * np.array(noises))
-    far_off = (missed > LARGEST_MISSED) | beside_others
-    if np.mean(far_off) > 0.5:
+    # 5, 3, 0.01: times the median of all trials, times its own noise, and part of its growth, from which a trial is far
+    # off (chosen)
+    beside_others = (missed > 5 * np.median(missed)) & (missed > 3 * np.array(noises)) & (missed > 0.01)
+    far_off = np.flatnonzero((missed > LARGEST_MISSED) | beside_others).tolist()
+    if len(far_off) > 0.5 * len(data) or len({data[i].trial.condition for i in far_off}) < len(far_off):
         return {}
-    return {data[i].trial.name: float(missed[i]) for i in np.flatnonzero(far_off).tolist()}
+    return {data[i].trial.name: float(missed[i]) for i in far_off}
 
 
 def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Diagnosis:

@@ -234,8 +234,9 @@ def _best_option(
         predicted = float(worth_of(design)[0])
         # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
-            before, trials = predicted, [conditions[k] for k in design]
+            trials = [conditions[k] for k in design]
             options.append((trials, simulated_separations(tied, trials)))
+            before = min(predicted, float(worth(options[-1][1])))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
             if _smaller(options[-1][1]).min() >= 8.0:

@@ -485,14 +485,14 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
 
 
 def not_better(table: pd.DataFrame) -> list[Remark]:
-    """The effects of a ladder with which the error on left-out conditions, or on the highest pressure, does not fall:
-    that contradicts an adequate model.
+    """The effects of a ladder with which the error on left-out conditions, or on the highest pressure, does not fall,
+    nor with those after them: that contradicts an adequate model.
     """
     return [
         remark("left_out_error_does_not_fall", name=name, highest=highest, without_m=without_m, with_m=with_m)
         for highest, errors_m in ((False, table["rms_left_out_m"]), (True, table["rms_highest_pressure_m"]))
-        for name, without_m, with_m in zip(table["added"][1:], errors_m, errors_m[1:], strict=False)
-        if with_m >= without_m
+        for k, (name, without_m, with_m) in enumerate(zip(table["added"][1:], errors_m, errors_m[1:], strict=False), 1)
+        if errors_m[k:].min() >= without_m
     ]
 
 

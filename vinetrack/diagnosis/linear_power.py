@@ -182,7 +182,7 @@ def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
     noise = f"{1e3 * fit.noise_m:.3g} mm, correlation {fit.noise_correlation:.2f}"
     rows = [PowerInput("noise of a position", noise, "fit")]
     for name, spread in fit.spreads.items():
-        origin = "fit" if spread.estimated else "assumed: too few trials to estimate it"
+        origin = "fit" if spread.estimated else "assumed, not estimated"
         rows.append(PowerInput(f"spread of {name} from trial to trial", f"{100 * spread.value:.2g} %", origin))
     return rows
 

@@ -253,10 +253,11 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         tried = [force.learned] if force.learned is not None and is_open else []
         start, tables = _fitted(before, tried, Path(folder), report)
         tables = [
-            replace(table, rms_left_out_m=left_out_error(table.ratio.fit))
+            told
             for table in tables
             if _explains(start, table.ratio)
             and all(law.ratio.deviance_excess(table.ratio) > ANSWER_SET_DELTA_CHI2 for law in tied)
+            and (told := replace(table, rms_left_out_m=left_out_error(table.ratio.fit))).rms_left_out_m < error_m
         ]
     return Proposal(before, error_m, tuple(laws), tied, reason, next(iter(tables), None))
 

@@ -548,14 +548,16 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return hypothesis.sigma >= tests.family[hypothesis.names[-1]]
 
     # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
-    # from it. Nothing is left to gain once the residuals of the best are no larger than the errors of the tracks and
-    # trials scatter no more than careful work allows.
+    # from it. Nothing is left to gain once the best has a plausible size, its residuals are no larger than the errors of
+    # the tracks, and trials scatter no more than careful work allows.
     for every in (False, True):
         hypotheses = [*search.extend(every=every), *alone]
         best = best_of(hypotheses) if hypotheses else None
         if not every and nothing_rejects and (best is None or best.sigma < SEARCH_SIGMAS):
             return nothing_found()
-        if best is None or (not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(with_curves(best.fit)))):
+        if best is None or (not every and not best.plausible):
+            continue
+        if not every and (exceeds_slow_errors(best.fit) or has_excess_scatter(with_curves(best.fit))):
             continue
         if any(map(is_significant, answer_set(hypotheses)[0])):
             adequate, rejected, after = adequate_hypotheses(hypotheses, search)

@@ -28,7 +28,7 @@ PARAMETERS = (
         0.1,
         bounds=(1e-3, 1e2),
         zero=0.1,
-        plausible=(5e-3, 10.0),
+        plausible=(0.03, 10.0),
         tried=tuple(float(y) for y in np.geomspace(0.02, 2.0, 20)),
         meaning="growth at which it begins",
     ),

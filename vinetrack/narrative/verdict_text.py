@@ -273,7 +273,7 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
     if power is None:
         return "", ""
     if power.wary or not power.effects:
-        return "sizes that trials would detect were not computed", str(power.wary)
+        return "which smaller effects would be detected is not known", str(power.wary)
     found = {name for entry in diagnosis.rounds for name in entry.answer_set}
     unlikely = [entry.effect for entry in power.effects if entry.probability_at(entry.largest) < 0.9]
     missed = [name for name in unlikely if name not in found]
@@ -306,10 +306,11 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
     if TAIL_SLACK in diagnosis.effects:
         return "write `tail_slack: free` in experiment.yaml, and run again", ""
     if UNEXPLAINED in (verdict, last):
-        if diagnosis.not_tried:
-            return f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}: not tried so far", ""
         table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
         then = f"run `vinetrack propose {diagnosis.results}`"
+        if diagnosis.not_tried:
+            lacks = f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}, not tried so far, and run again"
+            return lacks, f"If that does not explain it: {then}; {told}."
         if table is not None and (near := list(table["added"][table["partial"]])):
             return f"see what `vinetrack add {near[0]} {diagnosis.results}`, a part, leaves; then {then}", told
         return f"look at the figures of the missing force, and {then}", told

@@ -153,7 +153,7 @@ def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     sizes, power = [], diagnosis.power
     told = [sentence("false_alarms", {"rate": power.false_alarm_rate})] if power is not None else []
     if power is not None and power.wary:
-        told.append(f"Detectable sizes were not computed: {power.wary}.")
+        told.append(f"Detectable sizes are not known: {power.wary}.")
     elif power is not None:
         sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     # Upper limits are valid only if no effect is missing.
