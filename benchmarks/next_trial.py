@@ -136,11 +136,7 @@ def measure(tie: Tie, seed: int) -> dict[str, float] | None:
     gained = [2 * (now.log_likelihood - was.log_likelihood) for now, was in zip(after, fits, strict=True)]
     (pair,) = found.separation_sigma
     promised = found.if_true_sigma[pair][tie.effect]
-    return {
-        "predicted": promised,
-        "realised": math.sqrt(max(gained[0] - gained[1], 0.0)) / promised,
-        "cpu": spent,
-    }
+    return {"predicted": promised, "realised": math.sqrt(max(gained[0] - gained[1], 0.0)) / promised, "cpu": spent}
 
 
 def main() -> None:

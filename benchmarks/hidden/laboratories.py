@@ -129,10 +129,7 @@ def two_rows_exchanged(laboratory: Laboratory, draw: Draw) -> Laboratory:
         and other.setting.pressure_kPa > 1.33 * one.setting.pressure_kPa
     ]
     i, j = pairs[draw.integers(len(pairs))]
-    shots[i], shots[j] = (
-        replace(shots[i], setting=shots[j].setting),
-        replace(shots[j], setting=shots[i].setting),
-    )
+    shots[i], shots[j] = (replace(shots[i], setting=shots[j].setting), replace(shots[j], setting=shots[i].setting))
     return replace(laboratory, shots=tuple(shots))
 
 
@@ -351,11 +348,7 @@ def inlet_half(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG00
         inlet_mm = round(0.5 * shot.setting.vine.diameter_mm, 2)
         area = math.pi * (inlet_mm / 1e3) ** 2 / 4
         shots.append(
-            replace(
-                shot,
-                setting=replace(shot.setting, inlet_mm=inlet_mm),
-                tube=shot.tube._replace(inlet_area=area),
-            )
+            replace(shot, setting=replace(shot.setting, inlet_mm=inlet_mm), tube=shot.tube._replace(inlet_area=area))
         )
     return replace(laboratory, shots=tuple(shots))
 

@@ -116,12 +116,10 @@ def _order_rows() -> list[Row]:
             columns=("order",),
         ),
         *_twice(
-            Row("regulator_reset", "regulator_reset", guessed, (rising, set_anew), BARE, quiet=0.5),
-            columns=("order",),
+            Row("regulator_reset", "regulator_reset", guessed, (rising, set_anew), BARE, quiet=0.5), columns=("order",)
         ),
         *_twice(
-            Row("day_gains_rising", "day_gains_rising", guessed, (rising, set_daily), BARE, quiet=0.5),
-            columns=WHEN,
+            Row("day_gains_rising", "day_gains_rising", guessed, (rising, set_daily), BARE, quiet=0.5), columns=WHEN
         ),
         *_twice(Row("day_zeros_rising", "day_zeros_rising", guessed, (rising, *several), **some), columns=WHEN),
         *_twice(Row("day_zeros_random", "day_zeros_random", guessed, (any_order, *several), **some), columns=WHEN),

@@ -228,9 +228,4 @@ def ask_bic_plain(kind: str, seed: int) -> Row:
     return ask_bic(kind, seed, scatter=False)
 
 
-METHODS = {
-    "vinetrack": ask_vinetrack,
-    "left_out": ask_left_out,
-    "bic": ask_bic,
-    "bic_plain": ask_bic_plain,
-}
+METHODS = {"vinetrack": ask_vinetrack, "left_out": ask_left_out, "bic": ask_bic, "bic_plain": ask_bic_plain}

@@ -25,10 +25,7 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "linear_damping": ({"b": 0.05}, {"b": 0.05}),
     "pressure_damping": ({"beta": 5e-6}, {"beta": 5e-6}),
     "tail_friction": ({"mu_w": 0.3}, {"mu_w": 0.3}),
-    "capstan_friction": (
-        {"capstan_C": 0.01, "capstan_mu": 0.8, "capstan_k": 6.0},
-        {"C": 0.01, "mu_c": 0.8, "k": 6.0},
-    ),
+    "capstan_friction": ({"capstan_C": 0.01, "capstan_mu": 0.8, "capstan_k": 6.0}, {"C": 0.01, "mu_c": 0.8, "k": 6.0}),
     "payload_friction": ({"mu_p": 0.3}, {"mu_p": 0.3}),
     "payload_drag": ({"drag_area": 1e-3}, {"drag_area": 1e-3}),
     "wall_stretch": ({"kappa": 3e-6}, {"kappa": 3e-6}),
@@ -39,10 +36,7 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
         {"stribeck_F": 0.5, "stribeck_speed": 1.5, "stribeck_power": 2.0},
         {"F_s": 0.5, "v_s": 1.5, "k": 2.0},
     ),
-    "supply_pulsation": (
-        {"ringing": 0.1, "ringing_hz": 22.0, "ringing_phase": 0.7},
-        {"a": 0.1, "f": 22.0, "phi": 0.7},
-    ),
+    "supply_pulsation": ({"ringing": 0.1, "ringing_hz": 22.0, "ringing_phase": 0.7}, {"a": 0.1, "f": 22.0, "phi": 0.7}),
     "end_stop": ({"stop_k": 8.0, "stop_y": 0.1}, {"k": 8.0, "y_0": 0.1}),
     "quadratic_length_friction": ({"square_q": 3.0}, {"q": 3.0}),
     "length_scale": ({}, {"eps": 0.03}),

@@ -102,7 +102,7 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, 
 
     for stage in ("trials", "model"):
         succeed(stage, folder, results)
-    (results / "provenance.json").write_text(json.dumps({"experiment": str(folder)}))
+    (results / "provenance.json").write_text(json.dumps({"experiment": str(folder), "settings": {}}))
 
     def ladder() -> list[dict[str, str]]:
         return list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
@@ -131,6 +131,8 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, 
     assert "1/τ" in output
     assert read_experiment_settings(folder / "experiment.yaml").model[-2:] == ("reservoir_depletion", "leak")
     assert command_for_results(folder, results) in output.replace("\n", " ")
+    succeed("diagnose", results)  # of the model that was saved, with its fit
+    assert json.loads((results / "fit.json").read_text())["model"][-2:] == ["reservoir_depletion", "leak"]
     assert run("add", "reservoir_depletion", results).exit_code == 1
     monkeypatch.setattr(proposing, "fit_with", lambda *given: replace(fit_with(*given), converged=False))
     assert run("add", "air_drag", results, "--save").exit_code == 1

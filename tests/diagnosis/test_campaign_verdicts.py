@@ -316,12 +316,10 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
 
 
 def test_trials_that_only_the_initial_model_misses_by_far_are_no_reason_to_look_at_their_rows(depleted, monkeypatch):
-    of_initial, of_final = (
-        np.sort(relative_residuals(fit.predictor, fit.solution))[-2:].mean() for fit in depleted.fits
-    )
+    missed = [np.sort(relative_residuals(fit.predictor, fit.solution))[-2:] for fit in depleted.fits]
     fit = replace(depleted.fits[0], left_out={"still": "it stands"})
-    for limit, told in ((of_initial, False), (of_final, True)):
-        monkeypatch.setattr("vinetrack.diagnosis.diagnose.LARGEST_MISSED", limit)
+    for largest, told in zip(missed, (False, True), strict=True):
+        monkeypatch.setattr("vinetrack.diagnosis.diagnose.LARGEST_MISSED", largest.mean())
         again = {note.code: note.facts for note in diagnosed(fit, FEW[:1]).notes}
         assert bool({"far_off", "odd_trials"} & {*again}) == told
         assert again["not_in_the_fit"] == {"names": ["still"], "reason": "it stands"}
@@ -363,6 +361,8 @@ def test_an_effect_that_predicts_no_condition_better_is_said_to():
     told = not_better(table.assign(rms_highest_pressure_m=[3.88, 4.16]))
     assert [(one.code, one.facts["highest"]) for one in told] == [("left_out_error_does_not_fall", k) for k in (0, 1)]
     assert not_better(table.assign(rms_left_out_m=[4.09, 3.2], rms_highest_pressure_m=np.nan)) == []
+    of_pair = {"added": ["", "one", "two"], "rms_left_out_m": [9.2, 35.0, 5.1], "rms_highest_pressure_m": np.nan}
+    assert not_better(pd.DataFrame(of_pair)) == []
 
 
 def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:

@@ -111,7 +111,6 @@ def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path
 
 def by_hand(times, pressure, first_Pa: float, tau: float, down: float, mu: float) -> tuple[np.ndarray, list[float]]:
     """Lead positions, and when the tail went slack and taut in turn.
-
     State (x, ẋ, y, P of a chamber of 3.7 L filled within τ): taut while T₁ = ½(P − P_y)A − ½Bẋⁿ ≥ 0, slack until
     x = 2y; the slack tip has (P − P_y)A = B(2ẏ)ⁿ. `pressure(t, P)` is what drives.
     """

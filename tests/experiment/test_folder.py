@@ -399,7 +399,7 @@ NOT_ALLOWED = {
     "model": ("[gravity, gravity]", "gravity"),
     "ambient_pressure_kPa": ("101325", "true"),
     "strict": ("3",),
-    "axis": ("3", "{from_px: [1, 1], to_px: [1, 1]}", "{from_px: [1, 1], via_px: [[2, 2]], to_px: [9, 9]}"),
+    "axis": ("3", "{from_px: [1, 1], to_px: [9, 1]}", "{from_px: [1, 1], via_px: [[2, 2]], to_px: [9, 9]}"),
     "calibration": (
         "{kind: mm_per_px, mm_per_px: 0}",
         "{kind: mm_per_px}",

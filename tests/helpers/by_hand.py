@@ -1,8 +1,6 @@
 """A vine followed by SciPy from an equation that a test writes out in full, and the same vine by the compiled model.
-
 One compiled model serves all tests: that of the diagnoses, the whole catalogue with every effect at no size that the
-test does not name.
-Nothing here but `simulated` uses the package's own physics.
+test does not name. Nothing here but `simulated` uses the package's own physics.
 """
 
 import math
@@ -78,7 +76,6 @@ def simulated(vine: Vine, sizes: Mapping[str, float], times, trace=None, **other
 
 def followed(acceleration, stop: float, *, chamber=None, until=20.0, max_step=np.inf) -> Callable[[Floats], Floats]:
     """Tail travel against time by SciPy, from rest to x = `stop`.
-
     `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Its
     last time, at `stop`, is kept as the attribute `end`, (x, ẋ) against time as `state`.
     """

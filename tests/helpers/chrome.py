@@ -1,5 +1,4 @@
 """Chromium driven over its DevTools protocol, by the websocket client that comes with bokeh's server: no further tool.
-
 What the page complains of and everything it asks the network for is kept, for a test to look at.
 """
 

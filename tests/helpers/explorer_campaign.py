@@ -1,5 +1,4 @@
 """Results folders for the explorer's tests: simulated tracks of the demonstration's vines, with a small chamber.
-
 The truth is that of the demonstration: two vines, n 0.37, B 1.83 and 6.44, reservoir depletion (γ 1.4) that is
 missing from the model in use. Seed 20 everywhere; nothing here scores a method.
 """

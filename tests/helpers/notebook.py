@@ -1,5 +1,4 @@
 """Notebooks run without a server: their code cells one after the other, and what each shows.
-
 `python tests/helpers/notebook.py docs/python.ipynb` runs one and writes its outputs into it.
 """
 

@@ -1,5 +1,4 @@
 """Recordings with a known leading edge, drawn by code that shares nothing with the package: a truth of another hand.
-
 `plain_scene` draws frames in memory, of a tube that grows straight on or along a curve; `write_video` and
 `write_images` put them in files.
 """

@@ -20,7 +20,6 @@ from vinetrack.paper import rows as lines
 
 def test_what_the_chamber_the_injector_and_the_sizes_say():
     """π × 12² mm² × 280 mm = 126.67 mL of 3700 mL; the gas law holds for absolute pressure.
-
     The injector: 2.5² × 12.5 over 15² × 20: 1/57.6 = 1.736 %; 149.325 × (1 − 1/1.017361) = 2.5482 kPa of 48.
     """
     assert motions.volume_change(3.7e-3, 24.0, 280.0) == pytest.approx(0.126669 / 3.7, rel=1e-5)
@@ -49,7 +48,6 @@ def departures():
 
 def by_scipy(pressure_Pa, gamma, time_s, payload_kg=35.6e-3, wall=1.0) -> np.ndarray:
     """Growth y, m, and speed, m/s, of Fig. 4's vine, with a chamber that nothing refills, or stays full at γ = 0.
-
     Another wall, in units of 200 µm, has its film, and B in proportion to it. Shape (2, n); the last once it is grown.
     """
     vine = replace(LOADED, P=pressure_Pa, B=wall * B, t=wall * 200e-6, payload=payload_kg)
@@ -74,7 +72,6 @@ def test_depletion_by_another_integrator(departures, pressure_kPa, gamma, name):
 
 def test_the_tail_goes_slack_when_the_balance_says_and_leaves_the_tip_alone(departures):
     """At 7 kPa from the start, at 14 kPa after about 24 ms, at 28 kPa after about 145 ms.
-
     At 7 kPa the tip follows (P − P_y)A = B(2ẏ)ⁿ: 1.8096 N, ẏ = ½ (1.8096/6.44)^(1/0.37) = 0.01622 m/s all the way.
     """
     slack = departures[(departures["figure"] == "Fig. 4") & (departures["departure"] == "slack")]
@@ -95,7 +92,6 @@ def test_drag_by_mechanics_is_an_eighth_of_what_is_printed():
 
 def test_without_weight_and_noise_the_published_rule_finds_what_was_put_in_and_less_where_a_chamber_sags():
     """Horizontal vines weigh nothing along their path: what is left is the window's own bias.
-
     Of a chamber the larger vines lose most, and most where they are slow: set pressure overstates the force there.
     """
     trials = []

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from commanded import fit_law, succeed
+from commanded import fit_law, run, succeed
 from explorer_campaign import ROUGH_FIGURES, make_results
 from lsoda_vine import small_campaign
 from test_pipeline import MODEL_HEADERS
@@ -163,6 +163,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder, 
     now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
     assert "of campaigns" in succeed("power", tmp_path, size, "--reach", "0.9", "--sheet", rows)
+    assert all(run("power", tmp_path, f"leak={wrong}").exit_code == 1 for wrong in ("-1", "0", "inf", "x"))
     pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(tmp_path / "trials.csv", index=False)
     again = power_of_target(PowerRequest(tmp_path))["leak"]
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88

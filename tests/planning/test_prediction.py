@@ -41,7 +41,6 @@ def certain(one: Trial, B: float) -> guess.PredictiveInputs:
 
 def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
     """42, 47, 52 m/s at 90, 95, 98 % of the length, with the guessed B ≈ 3.3.
-
     At 99 % the film weighs 0.04 g: less than a quarter of the gas, 0.1 g, which is the floor of what moves. With it
     Eq. (2) gives 53.8 m/s there, 55 without.
     """

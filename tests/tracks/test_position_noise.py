@@ -201,9 +201,7 @@ def test_rounded_positions_have_no_outliers_or_missing_frames(step_m, every):
         assert not correct_frames(reject_outliers(plain_track(track.time_s[::every], position_m))).notes
 
 
-def smooth_tracks(
-    seed: int, rho: float = 0.0, smooth=lambda y: y, rest_s: float = 0.02, noise_m: float = 1e-4
-) -> list[tuple[Trial, Track]]:
+def smooth_tracks(seed: int, rho=0.0, smooth=lambda y: y, rest_s=0.02, noise_m=1e-4) -> list[tuple[Trial, Track]]:
     """Eight, from rest until then, at up to 3 m/s."""
     draw, since = np.random.default_rng(seed), np.clip(TIME_S - rest_s, 0.0, None)
     grown_m = 3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01)))
@@ -225,10 +223,8 @@ def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree, 
     assert 1 < found.decimation < frames if degree else found.decimation == frames
 
 
-@pytest.mark.parametrize(("order", "cutoff"), [(2, 0.2), (4, 0.1), (2, 0.1)])
-@pytest.mark.parametrize("decimals", [5, 12])
+@pytest.mark.parametrize(("order", "cutoff", "decimals"), [(2, 0.2, 5), (4, 0.1, 12), (2, 0.1, 5)])
 def test_a_low_pass_is_found_with_its_cutoff_from_positions_at_rest(order, cutoff, decimals):
-    """Others than it are not: noise that is correlated, rounded, or hardly there."""
     b, a = butter(order, 2 * cutoff)
     told = low_passed(smooth_tracks(356, smooth=lambda y: np.round(filtfilt(b, a, y), decimals), rest_s=0.06))
     assert told.facts["cutoff"] == pytest.approx(cutoff, rel=0.35)

@@ -317,7 +317,6 @@ def instants(frames: np.ndarray, exposure: float) -> np.ndarray:
 
 def step_frames(edge_px: np.ndarray, noise: float = 2.0, seed: int = 331) -> np.ndarray:
     """A straight front between background of 60 and film of 160, blurred by 1 px, averaged over instants.
-
     `edge_px` has shape (n_frames, n_instants) or (n_frames, n_instants, n_bands): a front for each band of rows.
     """
     bands = edge_px if edge_px.ndim == 3 else edge_px[:, :, None]

@@ -128,8 +128,8 @@ def diagnose(
 
 def _far_off(fit: Fit) -> dict[str, float]:
     """Trials that a model misses though it describes the others, and by which part of their growth: by far in itself,
-    or far more than by their noise and than it misses the others. None where half of the trials are missed, or two of a
-    condition, of which physics is the cause.
+    or far more than by their noise and than it misses the others. None where half are missed, or two of a condition:
+    that is physics.
     """
     missed, data = relative_residuals(fit.predictor, fit.solution), fit.predictor.data
     noises = [trial_data.noise_m / max(float(np.ptp(trial_data.lead_position_m)), 1e-9) for trial_data in data]

@@ -357,11 +357,7 @@ def comparison_lines(compared: pd.DataFrame) -> list[str]:
 
 @in_one_blas_thread
 def compare(
-    fit: Fit,
-    pairs: Pairs,
-    *,
-    kinematics: Mapping[str, Kinematics] | None = None,
-    final_at_fraction: float = 0.95,
+    fit: Fit, pairs: Pairs, *, kinematics: Mapping[str, Kinematics] | None = None, final_at_fraction: float = 0.95
 ) -> Comparison:
     """Compare a fitted model with trials."""
     aligned = align_trials(fit)
@@ -411,10 +407,7 @@ def position_errors(together: Replicates) -> dict[str, float]:
 
 
 def _final_speed_errors(
-    aligned: AlignedTrials,
-    tracks: Mapping[str, Track],
-    kinematics: Mapping[str, Kinematics],
-    at_fraction: float,
+    aligned: AlignedTrials, tracks: Mapping[str, Track], kinematics: Mapping[str, Kinematics], at_fraction: float
 ) -> dict[str, float]:
     """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position. A
     model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.

@@ -39,14 +39,7 @@ from vinetrack.diagnosis.misfit_tests import (
     scores_of,
     testable,
 )
-from vinetrack.diagnosis.result import (
-    ADEQUATE,
-    PROBABILITIES,
-    EffectPower,
-    Power,
-    PowerInput,
-    SimulatedRates,
-)
+from vinetrack.diagnosis.result import ADEQUATE, PROBABILITIES, EffectPower, Power, PowerInput, SimulatedRates
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.effects import Effect, EffectError
@@ -213,11 +206,7 @@ def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
 
 
 def _effect_power(
-    tests: MisfitTests,
-    effect: Effect,
-    start: Fit | None,
-    null_scores: Floats,
-    inflation: Floats,
+    tests: MisfitTests, effect: Effect, start: Fit | None, null_scores: Floats, inflation: Floats
 ) -> EffectPower | None:
     """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %; those of finite
     size from linear theory, without `start`.

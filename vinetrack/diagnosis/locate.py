@@ -20,13 +20,7 @@ import pandas as pd
 from scipy.special import ndtri, stdtr
 
 from vinetrack.core.problems import Remark, remark
-from vinetrack.diagnosis.ladder import (
-    AlignedTrials,
-    align_trials,
-    orthogonal_part,
-    rms_of,
-    within_groups,
-)
+from vinetrack.diagnosis.ladder import AlignedTrials, align_trials, orthogonal_part, rms_of, within_groups
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG

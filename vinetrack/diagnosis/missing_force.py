@@ -27,13 +27,7 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.diagnosis.force_inversion import (
-    FittedMotion,
-    ForceEquations,
-    ForceEstimate,
-    ForcePoint,
-    ForceProblem,
-)
+from vinetrack.diagnosis.force_inversion import FittedMotion, ForceEquations, ForceEstimate, ForcePoint, ForceProblem
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import (
@@ -47,12 +41,7 @@ from vinetrack.inference.gaussian_processes import (
 )
 
 # What a force may depend on, and the attribute of a motion that holds it
-VARIABLES = {
-    "growth": "lead_position_m",
-    "speed": "tail_velocity_m_s",
-    "time": "time_s",
-    "pressure": "pressure_Pa",
-}
+VARIABLES = {"growth": "lead_position_m", "speed": "tail_velocity_m_s", "time": "time_s", "pressure": "pressure_Pa"}
 
 # What a force may be where growth begins. A force that is free there competes with B, n and P_y, and has to be worth a
 # Δχ² of the answer set: those are believed first.

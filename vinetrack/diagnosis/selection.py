@@ -58,7 +58,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import Model, Value, probe
 from vinetrack.effects import Effect, Parameter
-from vinetrack.inference.fit_result import EXPONENT, Fit
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import assemble
@@ -410,7 +410,7 @@ def adequate_hypotheses(
 
 
 # ------------------------------------------------------------------------------
-# How much of a fitted size, or of n, may belong to another, undetected effect: "this K includes up to … of drag".
+# How much of a fitted size, or of n and B, may belong to another, undetected effect: "this K includes up to … of drag".
 #
 # Once a model is adequate, the other candidates are too weak to be detected, but not zero: air is never absent, a gauge
 # never perfect. If another effect were present with size s, a fitted θ would fall by L s, with L = I_θθ⁻¹ I_θs the
@@ -420,16 +420,16 @@ def adequate_hypotheses(
 
 
 def confounders_of(after: MisfitTests) -> tuple[Confounder, ...]:
-    """Find, for each size of an effect in the model, the physical effects that it may include, and for n, faults of the
-    measurement too, each in the shape that shifts it most. Returns for each those that could shift it by more than its
-    standard error, the largest first.
+    """Find, for each size of an effect in the model, the physical effects that it may include, and for n and B, faults
+    of the measurement too, each in the shape that shifts it most. Returns for each those that could shift it by more
+    than its standard error, the largest first.
     """
     shapes, chosen = after.products.shapes, list[Confounder]()
     of_numbers = zip(after.fit.numbers, after.fit.predictor.layout.free, after.scores.levers, strict=False)
     for number, free, scaled in of_numbers:
         name, lever = number.key.split(".")[0], scaled * free.derivative(number.value)
         is_size = name not in BASE_EFFECTS
-        if not (is_size or number.key == EXPONENT) or not 0 < number.sigma < math.inf:
+        if not (is_size or number.key in (EXPONENT, DAMPING)) or not 0 < number.sigma < math.inf:
             continue
         largest: dict[str, tuple[float, Confounder]] = {}
         for k, shape in enumerate(shapes):
@@ -548,8 +548,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return hypothesis.sigma >= tests.family[hypothesis.names[-1]]
 
     # All single effects where better ones may exist: linear predictions rank candidates well near the truth, not far
-    # from it. Nothing is left to gain once the best has a plausible size, its residuals are no larger than the errors of
-    # the tracks, and trials scatter no more than careful work allows.
+    # from it. Nothing is left to gain once the best has a plausible size, its residuals are no larger than the errors
+    # of the tracks, and trials scatter no more than careful work allows.
     for every in (False, True):
         hypotheses = [*search.extend(every=every), *alone]
         best = best_of(hypotheses) if hypotheses else None

@@ -319,8 +319,8 @@ def _violated_rules(
             yield (
                 "reservoir",
                 f"the reservoir of {1e3 * trial.chamber_m3:.3g} L loses {slow:.0%} (slow) to {fast:.0%} (fast) of its "
-                "gauge pressure while the vine grows, above 5%, unless a supply refills it; where no diagnosis excludes "
-                "them, add reservoir_depletion or supply_refill to the model, or measure the pressure",
+                "gauge pressure while the vine grows, above 5%, unless a supply refills it or a "
+                "diagnosis excludes it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
             )
     if tension["share_of_drive"] < -DOUBTFUL_COMPRESSION and trial.tail_slack != "free":
         yield (

@@ -22,14 +22,7 @@ KIND = "measurement"
 ORDER = 4
 PARAMETERS = (
     Parameter(
-        "k3",
-        "k₃",
-        "1/m²",
-        0.3,
-        bounds=(-50.0, 50.0),
-        shared="day",
-        plausible=(-1.0, 1.0),
-        meaning="radial distortion",
+        "k3", "k₃", "1/m²", 0.3, bounds=(-50.0, 50.0), shared="day", plausible=(-1.0, 1.0), meaning="radial distortion"
     ),
     Parameter(
         "y_c",

@@ -116,10 +116,7 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
 # Damping, steady speed and efficiency against the size of the vine.
 
 # Label of the axis, name and unit of each size
-_SIZES = {
-    "thickness_um": ("wall thickness (µm)", "wall", "µm"),
-    "diameter_mm": ("diameter (mm)", "diameter", "mm"),
-}
+_SIZES = {"thickness_um": ("wall thickness (µm)", "wall", "µm"), "diameter_mm": ("diameter (mm)", "diameter", "mm")}
 
 
 @figure("scaling", "damping", "Damping against size", data="scaling.json")

@@ -28,12 +28,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effect_prior,
     whitened_products,
 )
-from vinetrack.inference.optimiser import (
-    CONVERGED_VARIANCES,
-    Solution,
-    update_variances,
-    variance_change,
-)
+from vinetrack.inference.optimiser import CONVERGED_VARIANCES, Solution, update_variances, variance_change
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import systematics_of
 

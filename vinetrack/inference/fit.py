@@ -52,12 +52,7 @@ from vinetrack.inference.sensitivity import (
     best_start,
     initial_trial_effects,
 )
-from vinetrack.inference.solving import (
-    assemble,
-    solve_from,
-    solve_onward,
-    trial_fit,
-)
+from vinetrack.inference.solving import assemble, solve_from, solve_onward, trial_fit
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 
 # ------------------------------------------------------------------------------

@@ -395,10 +395,7 @@ class DenoisedTrace:
                 spans += [(begin, farthest), (farthest, end)]
         places = sorted(kept)
         return replace(
-            self,
-            time_s=self.time_s[places],
-            pressure_Pa=self.pressure_Pa[places],
-            errors_Pa=self.errors_Pa[places],
+            self, time_s=self.time_s[places], pressure_Pa=self.pressure_Pa[places], errors_Pa=self.errors_Pa[places]
         )
 
 

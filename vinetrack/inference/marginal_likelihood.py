@@ -428,12 +428,7 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
 
 
 def deviances(
-    part: Marginal,
-    problem: MixedProblem,
-    state: FitState,
-    spreads: Floats,
-    *,
-    restricted: bool = True,
+    part: Marginal, problem: MixedProblem, state: FitState, spreads: Floats, *, restricted: bool = True
 ) -> Floats:
     """−2 ln of the (restricted) likelihood at each of several between-trial standard deviations, profiled over the
     parameters. Shapes: spreads (n, 2) → (n,).
@@ -446,12 +441,7 @@ def deviances(
 
 
 def estimate_between_trial_sd(
-    part: Marginal,
-    problem: MixedProblem,
-    state: FitState,
-    estimable: tuple[bool, bool],
-    *,
-    restricted: bool = True,
+    part: Marginal, problem: MixedProblem, state: FitState, estimable: tuple[bool, bool], *, restricted: bool = True
 ) -> tuple[float, float]:
     """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search. The
     likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from the

@@ -24,13 +24,7 @@ from vinetrack.inference.errors import (
     with_systematics,
 )
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import (
-    YIELD_PRESSURE,
-    BetweenTrialSpread,
-    Fit,
-    Number,
-    TrialFit,
-)
+from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTrialSpread, Fit, Number, TrialFit
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
@@ -67,12 +61,7 @@ STEPS_TO_TELL = 4  # Steps by which it shows whether a fit stays poor (chosen)
 
 
 def solve_from(
-    predictor: Predictor,
-    theta: Floats,
-    fixed_terms: FixedTerms,
-    *,
-    least: float = -math.inf,
-    **how: Any,
+    predictor: Predictor, theta: Floats, fixed_terms: FixedTerms, *, least: float = -math.inf, **how: Any
 ) -> Solution:
     """Solve from given parameters and the releases that suit them, with the initial noise and standard deviations of
     `first_state`; `least` and `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
@@ -170,11 +159,7 @@ SPREAD_NAMES = ("pressure", "B")
 
 
 def fit_messages(
-    predictor: Predictor,
-    solution: Solution,
-    numbers: Sequence[Number],
-    precision: Precision,
-    chi2: float,
+    predictor: Predictor, solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
 ) -> tuple[Remark, ...]:
     """Warnings on convergence, on each number and on the size of the residuals; notes on the data."""
     told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
@@ -231,12 +216,7 @@ def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
     return notes
 
 
-def assemble(
-    predictor: Predictor,
-    solution: Solution,
-    left_out: Mapping[str, str],
-    options: Mapping[str, Any],
-) -> Fit:
+def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, str], options: Mapping[str, Any]) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout = predictor.layout
     with_errors = with_systematics(predictor, solution)
@@ -280,10 +260,7 @@ def assemble(
 
 
 def _numbers(
-    predictor: Predictor,
-    solution: Solution,
-    theta: Floats,
-    precision_of_fit: Precision,
+    predictor: Predictor, solution: Solution, theta: Floats, precision_of_fit: Precision
 ) -> tuple[Number, ...]:
     """The free parameters, the first entries of `theta`, with their errors and intervals."""
     layout, problem = predictor.layout, solution.problem

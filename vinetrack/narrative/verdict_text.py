@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-    from vinetrack.diagnosis.result import Candidate, Diagnosis
+    from vinetrack.diagnosis.result import Candidate, Confounder, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 
 
@@ -234,9 +234,13 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
     known = listed_names([*diagnosis.effects, *filter(None, [fault])])
     with_them = [f"with {known} in the model"] if law and known else []
-    refuted = law and not fault and diagnosis.final_verdict not in (ADEQUATE, "")
-    with_them += ["of a model that these trials refute"] if refuted else []
+    if diagnosis.answer_set == (DROPPED_FRAMES,):
+        with_them.append("with corrected times")
+    elif law and not fault and diagnosis.final_verdict not in (ADEQUATE, ""):
+        with_them.append("of a model that these trials refute")
     within = [f"n 95 %: {bounds_text(p)}{_confounded_interval(diagnosis, p)}" for p in law[:1]]
+    wider = [f"{p.title} {interval}" for p in law if p.key == DAMPING and (interval := _hull(diagnosis, p))]
+    within += [f"allowing for such effects {joined(wider)}"] if wider else []
     notes = [*within, *with_them, *_shared_remedies(law)]
     return ", ".join(map(estimate_text, law)), "; ".join(notes)
 
@@ -309,13 +313,15 @@ def _next_step(diagnosis: Diagnosis) -> tuple[str, str]:
         table, told = diagnosis.ladder, "it writes a law of the missing force as an effect file of your own"
         then = f"run `vinetrack propose {diagnosis.results}`"
         if diagnosis.not_tried:
-            lacks = f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}, not tried so far, and run again"
-            return lacks, f"If that does not explain it: {then}; {told}."
+            lacks = f"fill in what the sheet lacks for {listed_names(diagnosis.not_tried)}: not tried so far"
+            return lacks, f"If that does not explain it, {then}: {told}."
         if table is not None and (near := list(table["added"][table["partial"]])):
             return f"see what `vinetrack add {near[0]} {diagnosis.results}`, a part, leaves; then {then}", told
         return f"look at the figures of the missing force, and {then}", told
     if diagnosis.next_experiment:
         return str(diagnosis.next_experiment.get("text", "")), ""
+    if diagnosis.answer_set == (DROPPED_FRAMES,):
+        return "see what is said with corrected times; record again where it matters", ""
     if last == ARTEFACT:
         names = diagnosis.rounds[-1].answer_set
         return "correct the measurement, and run again", _remedies(names)
@@ -387,17 +393,24 @@ def estimates_text(row: Candidate) -> str:
 
 def _confounded_interval(diagnosis: Diagnosis, size: Number) -> str:
     """The wider interval of a size that allows for effects the data do not exclude (hull); blank without any."""
-    alike = [rival for rival in diagnosis.rounds[-1].confounded if rival.parameter == size.key]
-    if not alike:
-        return ""
-    factor = size.shown[1]
-    low, high = min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
     names = []
-    for rival in alike:
+    for rival in _rivals(diagnosis, size):
         unit, times = display_unit(rival.unit, size.pressure_unit)
         limit = f"{number(rival.limit * times, 2)} {unit}".rstrip()
         names.append(f"{spaced_name(rival.effect)} ({rival.symbol} as far as {limit})")
-    return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
+    return f"; allowing for {joined(names)}: {_hull(diagnosis, size)}" if names else ""
+
+
+def _rivals(diagnosis: Diagnosis, size: Number) -> list[Confounder]:
+    confounded = diagnosis.rounds[-1].confounded
+    return [rival for rival in confounded if (rival.parameter, rival.vine) == (size.key, size.vine)]
+
+
+def _hull(diagnosis: Diagnosis, size: Number) -> str:
+    """Ends of the wider interval of a number in its display unit; blank without any effect that it may include."""
+    alike, factor = _rivals(diagnosis, size), size.shown[1]
+    low, high = min((one.low_95 for one in alike), default=0.0), max((one.high_95 for one in alike), default=0.0)
+    return f"{number(factor * low, 4)} to {number(factor * high, 4)}" if alike else ""
 
 
 def bounds_text(entry: Number, with_unit: bool = False) -> str:

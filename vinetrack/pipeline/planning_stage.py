@@ -517,11 +517,14 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
         message = "is in the model already" if name in power.model else "is not a candidate for these trials"
         raise refusal("effect", name, message, remedy)
     unit, factor = known[name]
-    try:
-        return name, float(size or "nan") / factor
-    except ValueError:
-        remedy = f"write a number in {unit or 'the unit of the parameter'}"
-        raise refusal("effect", text, "is not a size", remedy) from None
+    sizes = catalogue()[name].parameters[:1] if name in catalogue() else ()
+    with suppress(ValueError):
+        value = float(size) / factor if size else math.nan
+        away = value - power[name].zero
+        if not size or (math.isfinite(away) and away != 0 and all(away * one.sign >= 0 for one in sizes)):
+            return name, value
+    remedy = f"write a number in {unit or 'the unit of the parameter'}, of the sign that the effect has"
+    raise refusal("effect", text, "is not a size", remedy)
 
 
 def _simulated_rates(

@@ -189,7 +189,7 @@ def code_hash() -> str:
 
 def identity(path: Path) -> tuple[tuple[str, int, int], ...]:
     """Name, size and time of modification of a file and of those that share its name, or of all files of a folder."""
-    files = path.rglob("*") if path.is_dir() else path.parent.glob(f"{path.stem}.*")
+    files = path.rglob("*") if path.is_dir() else (one for one in path.parent.iterdir() if one.stem == path.stem)
     stats = [(file.name, file.stat()) for file in sorted({path, *files}) if file.is_file()]
     return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)
 
@@ -226,7 +226,7 @@ class Kept:
 
     def forget(self) -> None:
         """Drop what no run has asked for in a long time."""
-        for path in self.folder.glob("*"):
+        for path in self.folder.glob(f"{'?' * 32}.*"):  # named by a key, as the steps of earlier runs are not
             if path.stat().st_mtime < time.time() - 30 * 86400:  # a month (chosen)
                 path.unlink(missing_ok=True)
 

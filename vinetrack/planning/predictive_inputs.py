@@ -515,7 +515,8 @@ class _Assembly:
             few = float(max(len(self.fit.fit.trials) - len(self.fit.fit.numbers), 3))
             for name, one in self.fit.fit.spreads.items():
                 symbol = {"pressure": "P"}.get(name, name)
-                known[symbol], origins[symbol] = one.value, f"{'estimated' if one.estimated else 'assumed'} in {self.fit.source}"
+                known[symbol], how = one.value, "estimated" if one.estimated else "assumed"
+                origins[symbol] = f"{how} in {self.fit.source}"
                 dof[symbol] = few if one.estimated else math.inf  # t of fewer degrees of freedom has no variance
         if trial.pressure_Pa > 0 and math.isfinite(trial.pressure_sigma_Pa):
             known["P"], origins["P"], dof["P"] = trial.pressure_sigma_Pa / trial.pressure_Pa, "stated", math.inf

@@ -87,8 +87,8 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     step_s, first_s = np.polyfit(place, time_s, 1)
     even_s = first_s + step_s * place
     off_s = float(np.max(np.abs(time_s - even_s)))
-    # Times must lie within 3/4 of their last digit, which matters from 1 % of a frame on, and three spacings differ from
-    # the others: a frame or two that are missing from exact times may lie so too.
+    # Times must lie within 3/4 of their last digit, which matters from 1 % of a frame on, and three spacings differ
+    # from the others: exact times from which a frame or two are missing may lie so too.
     uneven = np.abs(np.diff(time_s) - np.median(np.diff(time_s))) > 0.5 * digit_s
     if not step_s > 0 or off_s > 0.75 * digit_s or off_s < 0.005 * step_s or np.count_nonzero(uneven) < 3:
         return time_s, ""

@@ -61,9 +61,7 @@ class Smoothing:
 
 def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
     """Find the filter with which the positions of a campaign were smoothed; None where they were not."""
-    if rounding_m > 0:
-        return None
-    if not (spectra := _longest(pairs)):
+    if rounding_m > 0 or not (spectra := _longest(pairs, 3)):
         return None
     ranked: list[tuple[float, Smoothing | None]] = [(_unsmoothed(spectra), None)]
     for window, degree in product(range(3, 22, 2), (0, 2)):
@@ -79,42 +77,39 @@ def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0
 
 
 def low_passed(pairs: Iterable[tuple[Trial, Track]]) -> Remark:
-    """Say that positions were smoothed by a low-pass (Butterworth 1930, forwards and backwards, as programs of motion
-    analysis offer it), and about where it cuts off; blank where they were not. It shows at rest alone: a smooth motion
-    lacks high frequencies too.
+    """Say that positions were smoothed by a low-pass (Butterworth 1930, run both ways), and about where it cuts off;
+    blank where not. It shows at rest alone: a smooth motion lacks high frequencies too.
     """
-    if not (spectra := _longest(pairs, at_rest=True)):
+    if not (spectra := _longest(pairs, 0)):
         return Remark()
     gains = {}
     for cutoff, order in product(np.geomspace(0.02, 0.3, 15).tolist(), (2, 4)):
         ratios = (np.tan(math.pi * f) / math.tan(math.pi * cutoff) for f, _ in spectra)
         gains[_whittle(spectra, [np.maximum((1 + ratio ** (2 * order)) ** -2.0, 1e-8) for ratio in ratios])] = cutoff
     # 30.0: gain of ln L over noise without a low-pass that is sure (chosen)
-    is_sure = max(gains) > _unsmoothed(spectra) + 30.0
-    return remark("low_passed", cutoff=gains[max(gains)]) if is_sure else Remark()
+    return remark("low_passed", cutoff=gains[max(gains)]) if max(gains) > _unsmoothed(spectra) + 30.0 else Remark()
 
 
-Spectra = Sequence[tuple[Floats, Floats]]  # frequencies, 1/frame, and periodogram of the noise, of each stretch
-
-
-def _unsmoothed(spectra: Spectra) -> float:
+def _unsmoothed(spectra: Sequence[tuple[Floats, Floats]]) -> float:
     """The largest log-likelihood of noise that was not smoothed: first-order autoregressive."""
-    return max(
-        _whittle(spectra, [(1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * f) + rho**2) for f, _ in spectra])
-        for rho in np.linspace(0.0, 0.9, 10)
+    shapes = (
+        [(1 - r**2) / (1 - 2 * r * np.cos(2 * math.pi * f) + r**2) for f, _ in spectra] for r in np.arange(0, 1, 0.1)
     )
+    return max(_whittle(spectra, of_all) for of_all in shapes)
 
 
-def _longest(pairs: Iterable[tuple[Trial, Track]], *, at_rest: bool = False) -> Spectra:
+def _longest(pairs: Iterable[tuple[Trial, Track]], order: int) -> Sequence[tuple[Floats, Floats]]:
     """The twelve longest stretches of imported tracks."""
-    spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track, at_rest)]
+    spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track, order)]
     return sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:12]
 
 
-def _spectra(track: Track, at_rest: bool) -> Iterator[tuple[Floats, Floats]]:
-    """The spectrum of every evenly spaced stretch of a track, or of its rest, where that is no mere rounding."""
+def _spectra(track: Track, order: int) -> Iterator[tuple[Floats, Floats]]:
+    """Frequencies, 1/frame, and periodogram of the noise, of every evenly spaced stretch of a track, by differences of
+    this order, which remove the motion; of order 0 those of its rest, where that is no mere rounding.
+    """
     time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
-    if at_rest:
+    if order == 0:
         # 0.8: part of a rest that the beginning of a smoothed motion leaves (chosen)
         rest = position_m[: int(0.8 * rest_points(position_m))]
         time_s = time_s[: rest.size if rest.size and np.std(rest) > 2 * rounding_noise(position_m) else 0]
@@ -127,19 +122,17 @@ def _spectra(track: Track, at_rest: bool) -> Iterator[tuple[Floats, Floats]]:
     for part in np.split(np.arange(time_s.size), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
         if part.size < FEWEST_FRAMES:
             continue
-        # Third differences remove the motion, and change the noise by a known factor.
-        order = 0 if at_rest else 3
         differences = np.diff(position_m[part] - position_m[part].mean(), order)
         taper = np.hanning(differences.size + 1)[:-1]
         frequency = np.fft.rfftfreq(differences.size)
         power = np.abs(np.fft.rfft(differences * taper)) ** 2
-        compared = (frequency > (0.0 if at_rest else LOWEST_FREQUENCY)) & (frequency < 0.5)
+        compared = (frequency > (LOWEST_FREQUENCY if order else 0.0)) & (frequency < 0.5)
         power = power[compared] / (2 * np.sin(math.pi * frequency[compared])) ** (2 * order)
         if np.all(power > 0):
             yield np.asarray(frequency[compared], dtype=float), power
 
 
-def _whittle(spectra: Spectra, shapes: Sequence[Floats]) -> float:
+def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats]) -> float:
     """Log-likelihood of the spectra as sums of the given shape, white noise and rough motion, with free amplitudes. The
     amplitudes maximise it by multiplicative updates (Févotte, Bertin & Durrieu, Neural Computation 21, 793, 2009).
     """

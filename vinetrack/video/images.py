@@ -362,17 +362,22 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
         raise RecordingError("the folder holds no images", "expected PNG, JPEG, TIFF or DNG frames", folder.name)
     if unreadable := next((one for one in images if not (one.is_file() or one.is_dir()) and one.exists()), None):
         raise RecordingError(f"{unreadable.name} cannot be read: {NOT_A_FILE}", name=folder.name)
-    groups: dict[tuple[str, str], list[tuple[int, Path]]] = {}
+    named: dict[tuple[str, ...], list[tuple[list[int], Path]]] = {}
     for file in images:
-        match = re.fullmatch(r"(.*?)(\d+)\D*", file.stem)
-        if match:
-            groups.setdefault((match.group(1), file.suffix.lower()), []).append((int(match.group(2)), file))
-    if not groups:
+        texts = re.split(r"(\d+)", file.stem)  # with the numbers at odd places
+        if len(texts) > 1:
+            named.setdefault((*texts[::2], file.suffix.lower()), []).append((list(map(int, texts[1::2])), file))
+    if not named:
         return tuple(images), (), ()
-    longest = max(groups, key=lambda name: len(groups[name]))
-    group = sorted(groups[longest])
-    files = tuple(file for _, file in group)
-    numbers = tuple(number for number, _ in group)
+    # The number of a frame is that which differs most, the last of several; the others are those of a series.
+    alike = max(named.values(), key=len)
+    differing = [len(set(of_all)) for of_all in zip(*(numbers for numbers, _ in alike), strict=True)]
+    k = max(range(len(differing)), key=lambda place: (differing[place], place))
+    series: dict[tuple[int, ...], list[tuple[int, Path]]] = {}
+    for of_name, file in alike:
+        series.setdefault((*of_name[:k], *of_name[k + 1 :]), []).append((of_name[k], file))
+    longest = max(series.values(), key=len)
+    numbers, files = zip(*sorted(longest), strict=True)
     left_out = [f.name for f in images if f not in set(files)]
     what = f"{len(left_out)} images not numbered like the rest are left out"
     return files, numbers, (f"{folder.name}: {what}, first {left_out[0]}",) if left_out else ()
