@@ -97,8 +97,8 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_wha
     assert fold.high_95 > number.high
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
-    assert len(by_effect) + len(of_n) == len(found)
-    # Of the base model n alone, which a gauge that is off would move too.
+    assert {one.parameter for one in found} == {INLET, EXPONENT, "eversion_damping.B"}
+    # Of the base model n and B, which a gauge that is off would move too.
     n, by_gauge = after.fit[EXPONENT], of_n["pressure_gauge"]
     assert by_gauge.low_95 < n.low < n.high < by_gauge.high_95
 

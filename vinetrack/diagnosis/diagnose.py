@@ -188,9 +188,11 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     )
 
 
-def _refitted(single: LikelihoodRatio, **more: Any) -> Candidate:
-    """The row of a fitted effect."""
-    effect, known = single.effects[0], (single.delta_chi2, single.sigma, single.numbers, single.plausible)
+def _refitted(single: LikelihoodRatio, within: LikelihoodRatio | None = None, **more: Any) -> Candidate:
+    """The row of a fitted effect; what is known of it `within` a set is that of the set, and its size there."""
+    effect, told = single.effects[0], within or single
+    numbers = tuple(one for one in told.numbers if not within or one.key.split(".")[0] == effect.name)
+    known = told.delta_chi2, told.sigma, numbers, told.plausible
     return Candidate(effect.name, effect.kind, REFITTED, *known, **more)
 
 
@@ -203,13 +205,15 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     effects = {effect.name: effect for effect in tests.effects}
     rows = []
     reached = max((single.fit.log_likelihood for single in singles.values()), default=-math.inf)
+    sets = {name: one for one in reversed(step.answer_set) if len(one.names) > 1 for name in one.names}
     for name, single in singles.items():
-        in_answer_set = name in step.answer_names
+        within = sets.get(name) if name in step.answer_names else None
         row = _refitted(
             single,
-            in_answer_set=in_answer_set,
-            reason=rejected.get(name, single.reason),
-            along=single.others if in_answer_set else (),
+            within,
+            in_answer_set=name in step.answer_names,
+            reason=within.reason if within else rejected.get(name, single.reason),
+            along=(within or single).others if name in step.answer_names else (),
         )
         if not single.fit.converged and single.fit.log_likelihood < reached - FAR_BEHIND:
             row = replace(row, numbers=(), reason=remark("given_up"))

@@ -205,11 +205,12 @@ def expected_text(error_m: float, low_m: float, high_m: float) -> str:
     return f"{middle} mm ({low} to {high})" if math.isfinite(error_m) else ""
 
 
-def _settled(diagnosis: Diagnosis) -> tuple[Sequence[Number], str]:
-    """Parameters of the last model, fitted together with the fault of the measurement that remains, and its name."""
+def _settled(diagnosis: Diagnosis) -> tuple[Sequence[Number], Sequence[str]]:
+    """Parameters of the last model, fitted together with the faults of the measurement that remain, and their names."""
     last = diagnosis.rounds[-1]
     faults = [row for row in last.ranking if row.in_answer_set and row.along and last.verdict == ARTEFACT]
-    return (faults[0].along, faults[0].effect) if len(faults) == 1 else (diagnosis.parameters, "")
+    names = (last.sets or [(row.effect,) for row in faults])[:1]
+    return (faults[0].along, names[0]) if len(faults) == 1 else (diagnosis.parameters, ())
 
 
 def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
@@ -228,15 +229,15 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
     """Exponent n and B of the last model."""
-    numbers, fault = _settled(diagnosis)
+    numbers, faults = _settled(diagnosis)
     law = [p for p in numbers if p.key in (EXPONENT, DAMPING) and is_finite(p.value)]
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
-    known = listed_names([*diagnosis.effects, *filter(None, [fault])])
+    known = listed_names([*diagnosis.effects, *faults])
     with_them = [f"with {known} in the model"] if law and known else []
     if diagnosis.answer_set == (DROPPED_FRAMES,):
         with_them.append("with corrected times")
-    elif law and not fault and diagnosis.final_verdict not in (ADEQUATE, ""):
+    elif law and not faults and diagnosis.final_verdict not in (ADEQUATE, ""):
         with_them.append("of a model that these trials refute")
     within = [f"n 95 %: {bounds_text(p)}{_confounded_interval(diagnosis, p)}" for p in law[:1]]
     wider = [f"{p.title} {interval}" for p in law if p.key == DAMPING and (interval := _hull(diagnosis, p))]
