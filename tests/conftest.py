@@ -16,8 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # twentieth of their time.
 gc.set_threshold(50_000, 20, 50)
 
-FOLDERS = count()
-"""Numbers the folders of one process."""
+FOLDERS = count()  # Numbers the folders of one process
 
 
 @pytest.hookimpl(wrapper=True)

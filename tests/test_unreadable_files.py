@@ -93,8 +93,7 @@ PLACES = {
     "sheet": ("trials.csv", "", ""),
 }
 KINDS = ("pipe", "device", "itself")
-LONGEST_S = 200
-"""Chosen: All folders are checked in 15 s on a quiet machine; what waits for a pipe waits for ever."""
+LONGEST_S = 200  # Chosen: All folders are checked in 15 s on a quiet machine; what waits for a pipe waits for ever
 
 
 def _experiment(folder: Path, place: str, kind: str) -> None:

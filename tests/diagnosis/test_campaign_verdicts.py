@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -86,6 +87,17 @@ def test_what_is_missing_is_in_the_answer_with_its_size_and_nothing_where_nothin
     numbers = {number.key: number for number in row_of(said, kind).numbers}
     for key, size in hidden.truth.values.items():
         assert abs(numbers[key].value - size) < 4 * numbers[key].sigma
+
+
+@pytest.mark.slow
+def test_friction_of_a_reeled_tail_is_no_end_stop_that_begins_at_once():
+    level = {"length_m": 0.4, "growth_angle_rad": math.pi / 2, "tail_store": "reel", "payload_kg": 0.0, "vine": ""}
+    reeled = [
+        replace(tubes()[0], name=f"t{k}", diameter_m=D, thickness_m=t, pressure_Pa=P, condition="", **level)
+        for k, ((D, t), P, _) in enumerate(product(((0.012, 1e-4), (0.024, 2e-4)), (16e3, 24e3, 32e3), range(3)))
+    ]
+    pairs = hidden({"tail_friction.mu_w": 0.8}, seed=7304, trials=with_names(reeled))
+    assert diagnosed(pairs).effects == ("tail_friction",)
 
 
 @pytest.mark.slow

@@ -21,8 +21,7 @@ FORCES = {
     "slow": "1 / (0.3 + s.tail_velocity)",
     "waves": "np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)",
     "square": "(s.lead_position / 0.28) ** 2",
-}
-"""Forces that no catalogue has, of size 1."""
+}  # Forces that no catalogue has, of size 1
 PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0, 38.0, 48.0)}
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-DPI = 55
-"""Of pictures in a stored notebook. Chosen: about 30 kB each."""
+DPI = 55  # Of pictures in a stored notebook. Chosen: about 30 kB each
 
 
 def run(path: Path) -> list[list[dict]]:

@@ -60,8 +60,7 @@ BENT = Plan(
 BENDS: dict[str, dict] = {
     "quarter": {"pieces": ((120.0, 0.0), (471.2, 90.0), (90.0, 0.0))},
     "gentle": {"pieces": ((80.0, 0.0), (480.0, 25.0)), "from_px": (30.0, 200.0)},
-}
-"""Curves by name: a quarter circle of 300 px radius, a gentle bend of 1100 px."""
+}  # Curves by name: a quarter circle of 300 px radius, a gentle bend of 1100 px
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ PAPER = ROOT / "data" / "paper"
 LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))
 WORN = Should(("artefact",), any_of=("*order*",), only=("*order*",), true=("*order*",))
 BOTH = Should(("missing", "ambiguous"), ("drag",), all_of=("drag", "inlet"), true=("drag", "inlet"), holds=("drag.C",))
-FILM, BEHIND = 52428.0, 6553.0
-"""Levels of `clean` film (0.8) and of what is behind it (0.1) in 16 bits."""
+FILM, BEHIND = 52428.0, 6553.0  # Levels of `clean` film (0.8) and of what is behind it (0.1) in 16 bits
 
 
 def few() -> list[Trial]:

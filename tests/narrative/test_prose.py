@@ -22,8 +22,7 @@ from vinetrack.narrative.verdict_text import bounds_text, estimate_text, verdict
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
-TOLD = "reason|explanation|note|sentence|words|why|answer|question"
-"""Names of what holds a sentence."""
+TOLD = "reason|explanation|note|sentence|words|why|answer|question"  # Names of what holds a sentence
 CUT = re.compile(
     rf"""(?:\b(?:{TOLD})\)?|_text\([^()]*\))\.(?:startswith|endswith|r?partition|remove(?:pre|suf)fix|find|index)\(["']"""
     rf"""|["'] (?:not )?in (?:str\()?(?:\w+\.)*(?:{TOLD})\b"""

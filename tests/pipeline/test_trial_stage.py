@@ -85,8 +85,7 @@ CELLS: Mapping[str, object] = {
     "steady": "0.01:0.02", "use": "no", "axis": "30,80:600,80",
     "frames_used": "2:60", "point_mass": None, "compare_sizes": "no", "position_systematic_mm": 0.1,
     "capture_fps_is_playback": "yes",
-}  # fmt: skip
-"""A changed cell of a column, else "other" or 2; None for those that make it another kind of trial."""
+}  # fmt: skip  # A changed cell of a column, else "other" or 2; None for those that make it another kind of trial
 CELLS = {name: CELLS.get(name, "other" if column.kind == "text" else 2) for name, column in COLUMNS.items()}
 RETRACKED = {"capture_fps", "exposure_us", "axis", "frames_used"}
 KEYS = (

@@ -225,9 +225,8 @@ def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree, 
 
 @pytest.mark.parametrize(("order", "cutoff", "decimals"), [(2, 0.2, 5), (4, 0.1, 12), (2, 0.1, 5)])
 def test_a_low_pass_is_found_with_its_cutoff_from_positions_at_rest(order, cutoff, decimals):
-    b, a = butter(order, 2 * cutoff)
-    told = low_passed(smooth_tracks(356, smooth=lambda y: np.round(filtfilt(b, a, y), decimals), rest_s=0.06))
-    assert told.facts["cutoff"] == pytest.approx(cutoff, rel=0.35)
+    filtered = smooth_tracks(356, 0.0, lambda y: np.round(filtfilt(*butter(order, 2 * cutoff), y), decimals), 0.06)
+    assert low_passed(filtered).facts["cutoff"] == pytest.approx(cutoff, rel=0.35)
     for rho, noise_m in ((0.0, 1e-4), (0.6, 1e-5), (0.9, 1e-4), (0.0, 1e-7)):
         assert not low_passed(smooth_tracks(357, rho, lambda y: np.round(y, decimals), 0.06, noise_m))
 

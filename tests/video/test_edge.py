@@ -32,8 +32,7 @@ from vinetrack.video.track import PointQuality, Tracking, ending_of, follow, mov
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
 MOUTH_PLAN = Plan(seed=520, width=640, height=200, from_px=(20.0, 100.0), end_px=520.0, rest_frames=15)
-AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
-"""Six rows beside the middle of the tube."""
+AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)  # Six rows beside the middle of the tube
 COLUMNS = 460
 LONG_AXIS = Axis((20.0, 59.5), (440.0, 59.5), 40.0)
 FITS = "from test_edge import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"

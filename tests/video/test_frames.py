@@ -33,8 +33,7 @@ RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
 NOISE = RNG.integers(0, 255, (60, 96, 128)).astype(np.uint8)
 DEEP = FRAMES.astype(np.uint16) * 17
-BEFORE, AFTER = 300, 180
-"""Frames of rest beyond those of the scene."""
+BEFORE, AFTER = 300, 180  # Frames of rest beyond those of the scene
 CAPTURE_FPS = 1069.0
 KEY_FRAMES = (0, 30, 60)
 
@@ -516,8 +515,7 @@ for _ in range(60):
         frames.read_frames(film)
     except (StopIteration, RuntimeError):
         pass
-"""
-"""A decoder left after two frames, sixty times over."""
+"""  # A decoder left after two frames, sixty times over
 
 
 @pytest.mark.slow
