@@ -437,7 +437,8 @@ class CheckReport:
     def to_json(self) -> dict[str, Any]:
         """Return the report for a program."""
         problems = [{key: value for key, value in vars(problem).items() if value} for problem in self.problems]
-        return {"recordings": list(self.recordings), "notes": list(self.notes), "problems": problems}
+        told = {"recordings": self.recordings, "lines": self.recording_lines, "notes": self.notes}
+        return {name: list(each) for name, each in told.items()} | {"problems": problems}
 
 
 def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:

@@ -468,7 +468,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     for end, begin in itertools.pairwise([*by_now.tolist(), len(first[0])]):
         if begin - end > RUN_PX and by_now[-1] - begin < len(first):
             left, after = slice(end + RUN_PX // 2, begin - RUN_PX // 2), np.flatnonzero(path > end - RUN_PX)
-            change = np.mean((strip.brightness(after)[:, :, left] - first[:, left]) ** 2, axis=1)
+            change = np.mean((strip.brightness(after, left) - first[:, left]) ** 2, axis=1)
             if np.median(change.max(axis=0, initial=0.0)) > LEAST_CHANGE * strip.noise**2:
                 changed, by_now = changed[changed <= end], by_now[by_now <= end]
                 break

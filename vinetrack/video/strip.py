@@ -38,10 +38,10 @@ class Strip:
     axis: Axis
     stabilised: bool
 
-    def brightness(self, frames: slice | Indices = slice(None)) -> Picture:
-        """Grey levels of 255, free of flicker, of some frames, shape (n_frames, n_across, n_along)."""
+    def brightness(self, frames: slice | Indices = slice(None), columns: slice = slice(None)) -> Picture:
+        """Grey levels of 255, free of flicker, of some frames and columns, shape (n_frames, n_across, n_columns)."""
         scale, offset = (of_frame[frames, None, None].astype(np.float32) for of_frame in (self.scale, self.offset))
-        return np.asarray(self.values[frames] * scale + offset)
+        return np.asarray(self.values[frames, :, columns] * scale + offset)
 
 
 @dataclass(frozen=True, kw_only=True)
