@@ -228,6 +228,17 @@ def _read_span(text: str, decimal: str, of_frames: bool) -> tuple[float, float]:
     return first, last
 
 
+def check_path(points: Sequence[tuple[float, float]]) -> None:
+    """Refuse a path in the picture, px, that is too short, or a curve with points too close."""
+    spacings = [math.dist(*pair) for pair in pairwise(points)]
+    if sum(spacings) < SHORTEST_AXIS_PX:
+        message = f"is shorter than {SHORTEST_AXIS_PX} pixels"
+        raise InputError(message, "give two points far apart", code="too_short")
+    if min(spacings) < SMALLEST_POINT_SPACING_PX:
+        message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
+        raise InputError(message, "leave out the second of the two", code="too_close")
+
+
 def _read_axis(text: str) -> PictureAxis:
     """Read an axis `x,y:x,y…[:width_mm]`: two or more points in the picture, and the width of the strip along them."""
     parts, width = text.split(":"), math.nan
@@ -235,13 +246,7 @@ def _read_axis(text: str) -> PictureAxis:
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
         raise InputError("is not an axis", code="not_an_axis")
     points = [(parse_number(x), parse_number(y)) for x, y in (point.split(",") for point in written)]
-    spacings = [math.dist(*pair) for pair in pairwise(points)]
-    if sum(spacings) < SHORTEST_AXIS_PX:
-        message = f"is shorter than {SHORTEST_AXIS_PX} pixels"
-        raise InputError(message, "give two points far apart", code="too_short")
-    if len(points) > 2 and min(spacings) < SMALLEST_POINT_SPACING_PX:
-        message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-        raise InputError(message, "leave out the second of the two", code="too_close")
+    check_path(points)
     if len(parts) > len(written):
         width = parse_number(parts[-1]) / 1000
         if width <= 0:

@@ -13,7 +13,7 @@ import re
 import types
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, Union, get_args, get_origin
 
@@ -25,15 +25,7 @@ from pydantic.functional_validators import AfterValidator, BeforeValidator, fiel
 from vinetrack.core.problems import ExperimentError, InputError, Problem
 from vinetrack.core.tables import Table, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
-from vinetrack.experiment.schema import (
-    COLUMNS,
-    LIMITED,
-    SHARED,
-    SHORTEST_AXIS_PX,
-    SMALLEST_POINT_SPACING_PX,
-    did_you_mean,
-    read_range,
-)
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, check_path, did_you_mean, read_range
 
 InFolder = Annotated[str, AfterValidator(COLUMNS["track"].read)]  # A path, checked as in the sheet
 NoTruth = BeforeValidator(lambda value: str(value) if isinstance(value, bool) else value)  # yes and no are no 1 and 0
@@ -69,14 +61,7 @@ class _TwoEnds(_Strict):
 
     @model_validator(mode="after")
     def _has_a_length(self) -> _TwoEnds:
-        through = (self.from_px, *(getattr(self, "via_px", None) or ()), self.to_px)
-        if hasattr(self, "via_px") and sum(math.dist(a, b) for a, b in pairwise(through)) < SHORTEST_AXIS_PX:
-            raise InputError(
-                f"is shorter than {SHORTEST_AXIS_PX} pixels", "name points farther apart", code="too_short"
-            )
-        if any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
-            message = f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-            raise InputError(message, "name points farther apart", code="too_close")
+        check_path((self.from_px, *(getattr(self, "via_px", None) or ()), self.to_px))
         return self
 
 
