@@ -145,7 +145,7 @@ MODULES = sorted(
     for path in (ROOT / "vinetrack").rglob("*.py")
     if path.name != "__init__.py" and ">>> " in path.read_text(encoding="utf-8")
 )
-FITTED = ("vinetrack.interface", "vinetrack.inference.fit", "vinetrack.inference.fit_summary")
+FITTED = ("vinetrack.interface", "vinetrack.inference.fit", "vinetrack.inference.errors")
 
 
 @pytest.mark.parametrize("name", [pytest.param(m, marks=[pytest.mark.slow] * (m in FITTED)) for m in MODULES])

@@ -26,7 +26,7 @@ _HOMES = {
     "compare": "vinetrack.interface",
     "diagnose": "vinetrack.interface",
     "example_tracks": "vinetrack.interface",
-    "film_influence": "vinetrack.inference.fit_summary",
+    "film_influence": "vinetrack.inference.errors",
     "fit": "vinetrack.interface",
     "load": "vinetrack.interface",
     "make_model": "vinetrack.dynamics.model",

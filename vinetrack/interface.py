@@ -31,8 +31,7 @@ from vinetrack.figures.model_figures import draw_power
 from vinetrack.figures.registry import FigureTables, describe_conditions, draw, figures_of, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import Fit, FitSummary
 from vinetrack.results import (
     Results,
     ResultsError,

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.inference.fit_summary import FitSummary
+    from vinetrack.inference.fit_result import FitSummary
 
 
 TRACK_COLUMNS = (
@@ -179,7 +179,7 @@ def table_of(columns: Sequence[str], rows: Sequence[Mapping[str, Any]] = ()) -> 
 
 def read_fit(results: Results) -> FitSummary:
     """Read `fit.json` as a typed object; its only reader."""
-    from vinetrack.inference.fit_summary import FitSummary
+    from vinetrack.inference.fit_result import FitSummary
 
     with _reading(results.fit):
         return FitSummary.from_json(read_json(results.fit))

@@ -23,10 +23,9 @@ from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products
 from vinetrack.inference.marginal_likelihood import FitState
-from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.optimiser import FixedTerms, solve, trial_costs
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
-from vinetrack.inference.trial_effects import trial_costs
 from vinetrack.interface import ERROR_COLUMNS
 from vinetrack.tracks.position_noise import rest_points
 

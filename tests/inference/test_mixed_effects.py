@@ -12,7 +12,6 @@ from scipy.stats import multivariate_normal
 
 from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.errors import precision
-from vinetrack.inference.fit_result import _deviate
 from vinetrack.inference.gaussian_processes import at_correlation, products, whiten
 from vinetrack.inference.optimiser import Solution
 
@@ -242,14 +241,6 @@ def test_collinear_parameters_are_detected_and_the_later_one_is_left_where_it_is
     step, _ = marginal.step_within_bounds(twice.T @ twice, twice.T @ seen, far, far, free)
     assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
     assert step[4] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate():
-    # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
-    assert _deviate(np.array([math.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
-    assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)
-    # Far out both tails fall like exp(−s/2).
-    assert _deviate(np.array([40.0, 0.0]), np.eye(2)) == pytest.approx(39.9, abs=0.15)
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -11,8 +11,7 @@ from by_hand import LOADED, followed
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference.fit_result import Number
-from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.inference.fit_result import FitSummary, Number, TrialEstimates
 from vinetrack.kinematics.summary import CONDITION_COLUMNS
 from vinetrack.paper import motions
 from vinetrack.paper import rows as lines

@@ -20,6 +20,7 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.figures.registry import figures_of
 from vinetrack.laboratory import campaigns
 from vinetrack.pipeline import planning_stage
+from vinetrack.pipeline.analysis import _deviate
 from vinetrack.pipeline.planning_stage import PowerRequest, power_of_target
 from vinetrack.pipeline.workflow import STAGES
 from vinetrack.results import Results, measured_trials, read_json, read_result
@@ -222,3 +223,11 @@ def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_no
     positions = pd.read_csv(results / "paper_positions.csv")
     assert positions["pressure_kPa"].tolist() == [28.0]
     assert rows.loc["position_rms_28kPa", "ours"] == pytest.approx(100 * positions["rms_mean_m"].iloc[0])
+
+
+def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate():
+    # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
+    assert _deviate(np.array([np.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
+    assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)
+    # Far out both tails fall like exp(−s/2).
+    assert _deviate(np.array([40.0, 0.0]), np.eye(2)) == pytest.approx(39.9, abs=0.15)

@@ -15,8 +15,7 @@ from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures import registry as drawn
 from vinetrack.figures.registry import FigureTables
-from vinetrack.inference.fit_result import BetweenTrialSpread, Number
-from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.inference.fit_result import BetweenTrialSpread, FitSummary, Number, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.paper import motions
 from vinetrack.pipeline.analysis import all_steps, propose_effect, sheet_contradictions, with_contradictions

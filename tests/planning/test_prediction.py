@@ -10,8 +10,7 @@ from lsoda_vine import small_campaign
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.experiment import schema, settings
-from vinetrack.inference.fit_result import BetweenTrialSpread, Number
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import BetweenTrialSpread, FitSummary, Number
 from vinetrack.paper import motions
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess

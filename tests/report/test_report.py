@@ -20,7 +20,7 @@ from vinetrack.diagnosis.result import PROBABILITIES, Candidate, Diagnosis, Effe
 from vinetrack.figures.model_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import SECTIONS, figures_of
 from vinetrack.figures.style import render
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import FitSummary
 from vinetrack.paper.rows import SIMULATED
 from vinetrack.report import build
 from vinetrack.report.build import write_clip

@@ -58,10 +58,10 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import Model, Value, probe
 from vinetrack.effects import Effect, Parameter
+from vinetrack.inference.errors import assemble
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import assemble
 
 # ------------------------------------------------------------------------------
 # Fits of effects, and of sets of them by forward steps: from the best sets of k effects, those are added that the score

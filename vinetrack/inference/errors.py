@@ -1,4 +1,4 @@
-"""Errors of fitted parameters: precision with systematic errors, few trials, scatter of trials.
+"""Errors of fitted parameters, from systematic errors, few trials and the scatter of trials; and all that a fit states.
 
 The systematic errors (`vinetrack.inference.systematics`) are parameters of the linearised fit, each with its prior. Its
 likelihood compares hypotheses without crediting any of them with what such an error could explain.
@@ -6,16 +6,30 @@ likelihood compares hypotheses without crediting any of them with what such an e
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.model import values_by_key
 from vinetrack.experiment.schema import GROUPINGS
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import (
+    YIELD_PRESSURE,
+    BetweenTrialSpread,
+    Fit,
+    FitSummary,
+    Number,
+    TrialEstimates,
+    TrialFit,
+)
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
@@ -25,12 +39,21 @@ from vinetrack.inference.marginal_likelihood import (
     inverse_of_block,
     levenberg_marquardt_step,
     matrix_root,
+    solve_per_trial,
     trial_effect_prior,
     whitened_products,
+    with_diagonal,
 )
-from vinetrack.inference.optimiser import CONVERGED_VARIANCES, Solution, update_variances, variance_change
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
-from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.optimiser import (
+    CONVERGED_VARIANCES,
+    LARGEST_DEVIATION,
+    Solution,
+    chi2_per_dof,
+    update_variances,
+    variance_change,
+)
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 
 # ------------------------------------------------------------------------------
 # Uncertainty of the parameters of a fit: covariance and degrees of freedom.
@@ -347,4 +370,285 @@ def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floa
     sums = [_summed_over(each, single - single.mean(axis=0)) for each in (range(trials), groups)]
     return np.max([np.sum(one**2, axis=0) * len(one) / max(len(one) - 1, 1) for one in sums], axis=0) * (
         (trials - 1) / max(trials - fitted, 1)
+    )
+
+
+# ------------------------------------------------------------------------------
+# Sensitivity of fitted numbers to the mass of the film.
+#
+# The mass of the film is computed from its thickness and density, which no sheet states to better than a few per
+# cent. It is not part of the stated errors, because it can be weighed and is then negligible. In a campaign of two
+# dozen precise trials it may exceed all stated errors, and the fit then says so.
+
+
+def film_influence(fit: Fit) -> Floats:
+    """Standard deviation of each fitted number due to an unknown film mass, independent by 2 % for each vine.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    array, shape (n_numbers,)
+        In the units of `fit.numbers`, SI. Zeros if the fit estimates the mass of the film, or it has no influence.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks())
+    >>> vt.film_influence(fit).shape
+    (3,)
+    """
+    if "film_mass" in fit.model:
+        return np.zeros(len(fit.numbers))
+    errors = systematics_of(fit.predictor, fit.solution, ["film"])
+    solution = with_systematics(fit.predictor, fit.solution).solution
+    plain = robust_variances(fit.predictor, solution)[0]
+    products = fit.predictor.products(errors.beside(solution.columns))
+    both = replace(solution, problem=errors.among(solution.problem), cross_products=products)
+    moved = (plain @ trial_information(both)[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
+    free = fit.predictor.layout.free
+    slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
+    return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
+
+
+def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...]:
+    """A message on the film mass where it matters as much as the stated errors, else none. Shapes: moved
+    (n_numbers,).
+    """
+    sigma = np.array([number.sigma for number in numbers])
+    ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
+    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= 1]
+    shown = [(numbers[k], moved[k], *numbers[k].shown) for k in affected]
+    changes = [(number.title, factor * size, unit) for number, size, unit, factor in shown]
+    return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
+
+
+# ------------------------------------------------------------------------------
+# Messages of a fit: warnings on its numbers, and notes on what was done to its data.
+
+
+SPREAD_NAMES = ("pressure", "B")
+
+
+def fit_messages(
+    predictor: Predictor, solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
+) -> tuple[Remark, ...]:
+    """Warnings on convergence, on each number and on the size of the residuals; notes on the data."""
+    told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
+    for k, number in enumerate(numbers):
+        named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
+        if precision.insensitive[k]:
+            told.append(remark("no_influence", **named, value=number.value))
+        elif math.isfinite(number.bound):
+            told.append(remark("at_bound", **named, bound=number.bound))
+        # 0.95, 1.05: ratios of fitted to stated error of P_y from which the trajectories are said not to constrain it,
+        # and why the fitted error exceeds the stated one (chosen)
+        elif math.isfinite(free.prior_sd) and number.sigma > 0.95 * free.prior_sd:
+            told.append(remark("not_constrained", title=number.title, wider=number.sigma > 1.05 * free.prior_sd))
+    if precision.collinear.any():
+        together = [n for n, collinear in zip(numbers, precision.collinear, strict=True) if collinear]
+        told.append(remark("not_separable", names=[f"{n.title} ({n.key})" for n in together]))
+    variance = np.diag(precision.covariance)
+    usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    for i, j in itertools.combinations(usable.tolist(), 2):
+        correlation = precision.covariance[i, j] / math.sqrt(variance[i] * variance[j])
+        # 0.98: correlation of two fitted numbers from which the fit warns (chosen)
+        if abs(correlation) > 0.98:
+            first, second = numbers[i].title, numbers[j].title
+            told.append(remark("correlated", first=first, second=second, correlation=float(correlation)))
+    varying = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
+    for k, name in enumerate(SPREAD_NAMES):
+        if varying[k] and not solution.estimable[k]:
+            told.append(remark("spread_taken", name=name, spread=solution.state.spread[k]))
+    # 2.0: χ² per degree of freedom from which the fit warns of misfit (chosen)
+    if chi2 > 2.0:
+        may_vary = [SPREAD_NAMES[k] for k in (1, 0) if varying[k]]
+        told.append(remark("misfit", ratio=math.sqrt(chi2), may_vary=may_vary))
+    by_source: dict[str, list[str]] = {}
+    for number in numbers:
+        if number.shared and number.shared_sigma**2 > 0.5 * number.sigma**2:
+            largest = max(number.shared, key=lambda source: number.shared[source])
+            by_source.setdefault(largest, []).append(number.title)
+    told += [remark("mostly_shared", names=titles, source=source) for source, titles in by_source.items()]
+    return (*told, *_notes_on_data(predictor.data))
+
+
+def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
+    """Notes on points with unequal weights, on positions that were smoothed before they were imported, and on recorded
+    pressures that the fit corrected.
+    """
+    notes = []
+    weighted = [each for each in data if np.ptp(each.point_sd[: each.time_s.size - each.sees_end]) > 0]
+    if weighted and weighted[0].blur_s > 0:
+        notes.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
+    elif weighted:
+        notes.append(remark("weighted_as_stated"))
+    smoothed = dict.fromkeys(trial_data.smoothing for trial_data in data if trial_data.smoothing is not None)
+    notes += [remark("smoothed", how=str(one), frames=one.decimation) for one in smoothed]
+    return notes
+
+
+def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, str], options: Mapping[str, Any]) -> Fit:
+    """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
+    layout = predictor.layout
+    with_errors = with_systematics(predictor, solution)
+    extended, count = with_errors.solution, len(layout.free)
+    by_noise = precision(extended)
+    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources).first(count)
+    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit)
+    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
+    chi2 = chi2_per_dof(predictor, solution)
+    points, state = solution.problem.points, extended.state
+    variance = float(np.average(state.variance, weights=points)) / (1 - state.rho**2)
+    # Yield pressures belong to the trials and stay in the numbers.
+    values = [
+        (number.key, number.vine, number.value)
+        for number in numbers
+        if number.key != YIELD_PRESSURE and layout.term(number.key) is None
+    ]
+    return Fit(
+        model=layout.model.with_values(values_by_key(values)),
+        numbers=numbers,
+        covariance=precision_of_fit.covariance * slopes[:, None] * slopes,
+        spreads={
+            name: BetweenTrialSpread(state.spread[k], solution.estimable[k])
+            for k, name in enumerate(SPREAD_NAMES)
+            if solution.problem.has_deviation[:, k].any()
+        },
+        noise_m=math.sqrt(variance),
+        noise_correlation=state.rho,
+        chi2_per_dof=chi2,
+        log_likelihood=solution.log_likelihood() + with_errors.gain,
+        trials=_trial_fits(predictor, solution, with_errors, by_noise.covariance[:count, :count]),
+        messages=fit_messages(predictor, solution, numbers, precision_of_fit, chi2),
+        left_out=dict(left_out),
+        converged=solution.converged,
+        iterations=solution.iterations,
+        predictor=predictor,
+        solution=solution,
+        options=options,
+        with_errors=state,
+    )
+
+
+def _numbers(
+    predictor: Predictor, solution: Solution, theta: Floats, precision_of_fit: Precision
+) -> tuple[Number, ...]:
+    """The free parameters, the first entries of `theta`, with their errors and intervals."""
+    layout, problem = predictor.layout, solution.problem
+    sigma = np.sqrt(np.diag(precision_of_fit.covariance))
+    dof = precision_of_fit.degrees
+    reach = student(dof)
+    numbers = []
+    for k, number in enumerate(layout.free):
+        low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
+        if not math.isfinite(sigma[k]):
+            low, high, method = problem.lower[k], problem.upper[k], "none"
+        low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
+        at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
+        slope = number.derivative(number.from_scaled(float(theta[k])))
+        shared = {name: math.sqrt(v[k]) * slope for name, v in precision_of_fit.shared.items() if v[k] > 0}
+        numbers.append(
+            Number(
+                **{name: getattr(number, name) for name in ("key", "vine", "symbol", "unit")},
+                value=number.from_scaled(float(theta[k])),
+                sigma=float(sigma[k]) * slope,
+                low=number.from_scaled(float(low)),
+                high=number.from_scaled(float(high)),
+                dof=float(dof[k]),
+                method=method,
+                bound=number.from_scaled(float(at[0])) if at else math.nan,
+                lower=number.from_scaled(float(problem.lower[k])),
+                upper=number.from_scaled(float(problem.upper[k])),
+                shared=shared if math.isfinite(sigma[k]) else {},
+                pressure_unit=predictor.data[0].trial.pressure_unit,
+            )
+        )
+    return tuple(numbers)
+
+
+def _trial_effect_sigma(solution: Solution, covariance: Floats) -> Floats:
+    """Standard errors of the trial effects, including those of the shared parameters, shape (n_trials, 4)."""
+    problem, state = solution.problem, solution.state
+    white = whitened_products(solution.cross_products, state)
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
+    inverse = solve_per_trial(square, np.broadcast_to(np.eye(N_TRIAL_EFFECTS), square.shape))
+    response = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
+    shared = np.pad(np.where(np.isfinite(covariance), covariance, 0.0), (0, 1))
+    shared_of_trial = shared[problem.index[:, :, None], problem.index[:, None, :]]
+    total = inverse + response @ shared_of_trial @ np.swapaxes(response, 1, 2)
+    sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
+    for k, column in enumerate((PRESSURE, DAMPING_DEVIATION)):
+        sigma[~problem.has_deviation[:, k], column] = 0.0
+    return np.asarray(sigma)
+
+
+def _trial_fits(
+    predictor: Predictor, solution: Solution, with_errors: WithSystematics, covariance: Floats
+) -> tuple[TrialFit, ...]:
+    """The trials at a solution, with the deviations and whitened residuals of the fit that includes the systematic
+    errors: one linear step, unbounded for a poor fit, so that the deviations are limited as those of a fit are.
+    """
+    state, sigma, reached = solution.state, _trial_effect_sigma(solution, covariance), with_errors.solution
+    trajectories = predictor.trajectories_at(state.theta, state.trial_effects)
+    deviations = np.clip(reached.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    effects = np.column_stack([state.trial_effects[:, :PRESSURE], deviations[:, PRESSURE:N_TRIAL_EFFECTS]])
+    trials = []
+    for i, (one, moved) in enumerate(zip(predictor.data, trajectories, strict=True)):
+        white = whiten(reached.columns[i][:, -1], one.first, reached.state.rho, one.relative_sd)
+        position_m, velocity_m_s, variance = moved.observed_position_m, moved.lead_velocity_m_s, state.variance[i]
+        trial = trial_fit(one, effects[i], position_m, velocity_m_s, state.rho, float(variance), sigma[i])
+        trials.append(replace(trial, whitened=white / math.sqrt(reached.state.variance[i])))
+    return tuple(trials)
+
+
+def trial_fit(
+    trial_data: FitTrial,
+    trial_effects: Floats,
+    position_m: Floats,
+    velocity_m_s: Floats,
+    rho: float,
+    variance: float,
+    sigma: Floats | None = None,
+) -> TrialFit:
+    """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
+    velocity_m_s (n_points,).
+    """
+    sigma = np.full(N_TRIAL_EFFECTS, math.nan) if sigma is None else sigma
+    predicted_m = position_m + trial_effects[ORIGIN]
+    residual_m = trial_data.lead_position_m - predicted_m
+    return TrialFit(
+        trial=trial_data.trial,
+        time_s=trial_data.time_s,
+        lead_position_m=trial_data.lead_position_m,
+        predicted_position_m=predicted_m,
+        predicted_velocity_m_s=velocity_m_s,
+        residual_m=residual_m,
+        whitened=whiten(residual_m, trial_data.first, rho, trial_data.relative_sd) / math.sqrt(variance),
+        release_s=float(trial_effects[RELEASE]),
+        release_sigma_s=float(sigma[RELEASE]),
+        origin_m=float(trial_effects[ORIGIN]),
+        origin_sigma_m=float(sigma[ORIGIN]),
+        pressure_deviation=float(trial_effects[PRESSURE]),
+        pressure_deviation_sigma=float(sigma[PRESSURE]),
+        damping_deviation=math.expm1(trial_effects[DAMPING_DEVIATION]),
+        damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
+        noise_m=math.sqrt(variance / (1 - rho**2)),
+    )
+
+
+def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
+    """The summary of a fit."""
+    keys = [entry.name for entry in fields(TrialEstimates)]
+    moved = film_influence(fit)
+    same = "numbers covariance spreads noise_m noise_correlation chi2_per_dof log_likelihood converged left_out"
+    return FitSummary(
+        **{name: getattr(fit, name) for name in same.split()},
+        names=tuple(fit.model.names),
+        moved_by_film=moved,
+        messages=tuple(map(str, (*fit.messages, *film_messages(fit.numbers, moved), *further_messages))),
+        warnings=tuple(warnings),
+        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
     )

@@ -25,7 +25,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
-from vinetrack.inference.errors import student, trial_information, without
+from vinetrack.inference.errors import assemble, student, trial_fit, trial_information, without
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import whiten
@@ -41,6 +41,8 @@ from vinetrack.inference.optimiser import (
     first_state,
     make_problem,
     solve,
+    solve_from,
+    solve_onward,
 )
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -52,7 +54,6 @@ from vinetrack.inference.sensitivity import (
     best_start,
     initial_trial_effects,
 )
-from vinetrack.inference.solving import assemble, solve_from, solve_onward, trial_fit
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 
 # ------------------------------------------------------------------------------

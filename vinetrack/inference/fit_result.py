@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
-from scipy.special import ndtri_exp
+from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 
 from vinetrack.core.problems import Remark
 from vinetrack.core.process import Drawn, Printed, table
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import decimals, display_unit, or_nan
-from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.model import Model, Value, values_by_key
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_data import FitError, FitTrial
 
@@ -541,52 +540,54 @@ def number_row(number: Number) -> tuple[str, ...]:
     return number.title, value, error, shared if number.shared else "", f"{low} to {high}", unit
 
 
-# ------------------------------------------------------------------------------
-# Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole trajectories.
-#
-# Both use the same recordings, but not the same part of them: steady windows show the final speed of a vine,
-# trajectories also the approach to it. If they differ by more than their errors, the model lacks an effect.
-
-CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory", "z")
+def _array(content: Any) -> Floats:
+    """An array of a JSON file, where null means that a number is not known."""
+    return np.array(content if content is not None else (), dtype=float)
 
 
-def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
-    """One row per vine, as `model_check.csv` holds it."""
-    import pandas as pd
-
-    if EXPONENT not in [number.key for number in fit.numbers]:
-        raise FitError("The exponent n was fixed in this fit: there is nothing to check the steady windows against.")
-    n = fit[EXPONENT]
-    rows = []
-    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
-        steady = (damping.get("vines") or {}).get(vine)
-        B = next((b for b in fit.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
-        n_steady = damping.get("n")
-        row: dict[str, object] = {
-            "vine": vine,
-            "n_steady": math.nan if n_steady is None else n_steady,
-            "n_trajectory": n.value,
-            "B_steady": steady["B"] if steady else math.nan,
-            "B_trajectory": B.value if B else math.nan,
-            "z": math.nan,
-        }
-        if steady and B and n_steady is not None:
-            difference = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
-            # Covariances of n and ln B of the vine.
-            names = damping["covariance"]["parameters"]
-            k = [names.index("n"), names.index(f"ln B {vine}")]
-            of_steady = np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
-            k, slopes = [fit.numbers.index(n), fit.numbers.index(B)], np.array([1.0, 1 / B.value])
-            of_trajectories = fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes
-            row["z"] = _deviate(difference, of_steady + of_trajectories)
-        rows.append(row)
-    return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
+Stored = Annotated[Floats, PlainValidator(_array), PlainSerializer(lambda array: array)]
 
 
-def _deviate(difference: Floats, covariance: Floats) -> float:
-    """Normal deviate as unlikely as this difference of two parameters, from χ² with two degrees of freedom."""
-    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
-        return math.nan
-    square = float(difference @ np.linalg.solve(covariance, difference))
-    # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
-    return -float(ndtri_exp(-square / 2 - math.log(2)))
+@dataclass(frozen=True, repr=False)
+class FitSummary(NumberTable, JsonRecord):
+    """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field. `names` are
+    those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the audit.
+    `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
+    """
+
+    names: Annotated[tuple[str, ...], Field(alias="model")] = ()
+    refused: Annotated[
+        str, BeforeValidator(lambda reason: reason or ""), PlainSerializer(lambda text: text or None)
+    ] = ""
+    numbers: tuple[Number, ...] = ()
+    covariance: Stored = field(default_factory=lambda: np.empty((0, 0)))
+    moved_by_film: Stored = field(default_factory=lambda: np.empty(0))
+    spreads: Mapping[str, BetweenTrialSpread] = field(default_factory=dict)
+    noise_m: OrNaN = math.nan
+    noise_correlation: OrNaN = math.nan
+    chi2_per_dof: OrNaN = math.nan
+    log_likelihood: OrNaN = math.nan
+    converged: bool = False
+    messages: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    trials: Mapping[str, TrialEstimates] = field(default_factory=dict)
+
+    @property
+    def fitted_values(self) -> dict[str, Value]:
+        """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
+        return values_by_key((number.key, number.vine, number.value) for number in self.numbers)
+
+    def to_json(self) -> dict[str, Any]:
+        """As `fit.json` holds it, SI; a refused fit has its model and the reason alone."""
+        content = super().to_json()
+        return {key: content[key] for key in ("model", "refused")} if self.refused else content
+
+    def __repr__(self) -> str:
+        state = "refused" if self.refused else f"{len(self.trials)} trials"
+        return f"FitSummary({' + '.join(self.names)}; {state})"
+
+    def __str__(self) -> str:
+        if self.refused:
+            return f"{' + '.join(self.names)} was not fitted: {self.refused}"
+        return "\n".join([self.heading, *numbers_text(self)])

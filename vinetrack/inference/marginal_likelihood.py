@@ -370,7 +370,7 @@ def trial_effect_step(cross_products: Floats, problem: MixedProblem, state: FitS
 def _held(precision: Floats, problem: MixedProblem) -> Floats:
     """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine filmed
     at steady speed alone nothing tells the release: a full step, far beyond its start or end, would spoil that of all
-    trials, and steps of several frames would undo what `trial_effects.likelier_releases` finds, time and again. Shapes:
+    trials, and steps of several frames would undo what `optimiser.likelier_releases` finds, time and again. Shapes:
     precision (n_trials, n_effects).
     """
     held = precision.copy()

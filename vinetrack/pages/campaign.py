@@ -25,8 +25,7 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.figures.registry import condition_labels
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
-from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, FitSummary, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.narrative.verdict_text import spaced_name

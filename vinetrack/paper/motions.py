@@ -20,7 +20,7 @@ from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
 from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
-from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.inference.fit_result import FitSummary, TrialEstimates
 from vinetrack.kinematics.damping import fit_damping
 from vinetrack.kinematics.steady import paper_force_N, paper_window
 from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error

@@ -20,7 +20,7 @@ from scipy.special import stdtr
 
 from vinetrack.core.records import Trial
 from vinetrack.core.units import GRAVITY_M_S2, convert, or_nan
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import FitSummary
 from vinetrack.kinematics.damping import regress
 from vinetrack.paper import motions
 from vinetrack.planning.prediction import GAMMAS, gauge_left

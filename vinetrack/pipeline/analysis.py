@@ -10,9 +10,10 @@ its tables have headers only, and `fit.json` states the reason.
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from importlib import import_module
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri_exp
 
 from vinetrack.core.problems import INTERNAL_ERROR, InputError, UserError, confirmed, remark
 from vinetrack.core.records import Track, Trial
@@ -45,9 +47,9 @@ from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_strip, draw_trial_motion
 from vinetrack.figures.registry import features
 from vinetrack.figures.style import blank, render
+from vinetrack.inference.errors import summary_of
 from vinetrack.inference.fit_data import FitError, Pairs
-from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
-from vinetrack.inference.fit_summary import FitSummary, summary_of
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit, FitSummary, TrialFit
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_half_steady, mark_left_out
 from vinetrack.kinematics.summary import (
     TrialMotion,
@@ -285,6 +287,55 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
     return table, mark_half_steady(points)
+
+
+# ------------------------------------------------------------------------------
+# Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole trajectories.
+#
+# Both use the same recordings, but not the same part of them: steady windows show the final speed of a vine,
+# trajectories also the approach to it. If they differ by more than their errors, the model lacks an effect.
+
+CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory", "z")
+
+
+def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
+    """One row per vine, as `model_check.csv` holds it."""
+    if EXPONENT not in [number.key for number in fit.numbers]:
+        raise FitError("The exponent n was fixed in this fit: there is nothing to check the steady windows against.")
+    n = fit[EXPONENT]
+    rows = []
+    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
+        steady = (damping.get("vines") or {}).get(vine)
+        B = next((b for b in fit.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
+        n_steady = damping.get("n")
+        row: dict[str, object] = {
+            "vine": vine,
+            "n_steady": math.nan if n_steady is None else n_steady,
+            "n_trajectory": n.value,
+            "B_steady": steady["B"] if steady else math.nan,
+            "B_trajectory": B.value if B else math.nan,
+            "z": math.nan,
+        }
+        if steady and B and n_steady is not None:
+            difference = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
+            # Covariances of n and ln B of the vine.
+            names = damping["covariance"]["parameters"]
+            k = [names.index("n"), names.index(f"ln B {vine}")]
+            of_steady = np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
+            k, slopes = [fit.numbers.index(n), fit.numbers.index(B)], np.array([1.0, 1 / B.value])
+            of_trajectories = fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes
+            row["z"] = _deviate(difference, of_steady + of_trajectories)
+        rows.append(row)
+    return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
+
+
+def _deviate(difference: np.ndarray, covariance: np.ndarray) -> float:
+    """Normal deviate as unlikely as this difference of two parameters, from χ² with two degrees of freedom."""
+    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
+        return math.nan
+    square = float(difference @ np.linalg.solve(covariance, difference))
+    # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
+    return -float(ndtri_exp(-square / 2 - math.log(2)))
 
 
 # ------------------------------------------------------------------------------

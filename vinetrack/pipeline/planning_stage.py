@@ -35,8 +35,7 @@ from vinetrack.figures.model_figures import draw_choice, draw_predictions, draw_
 from vinetrack.figures.style import write_figure
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit, FitSummary
 from vinetrack.narrative.diagnosis_text import trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.workflow import map_unordered
 from vinetrack.planning import prediction as vines

@@ -20,12 +20,12 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, RIG, with_names
 from vinetrack.experiment.settings import Limits
+from vinetrack.inference.errors import trial_fit
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
 from vinetrack.inference.marginal_likelihood import FitState, MixedProblem
 from vinetrack.inference.optimiser import Solution, make_problem
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Jobs, Predictor, initial_trial_effects
-from vinetrack.inference.solving import trial_fit
 from vinetrack.planning.predictive_inputs import damping_prior, hoop_stress_Pa
 from vinetrack.tracks.position_noise import ar1_noise
 

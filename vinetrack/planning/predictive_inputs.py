@@ -28,7 +28,7 @@ from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fi
 from vinetrack.inference.optimiser import TYPICAL_SPREADS
 
 if TYPE_CHECKING:
-    from vinetrack.inference.fit_summary import FitSummary
+    from vinetrack.inference.fit_result import FitSummary
 
 # ------------------------------------------------------------------------------
 # Scaling priors for vines that have not been measured, each with a standard error.
