@@ -18,7 +18,7 @@ from vinetrack.diagnosis import misfit_tests as hypotheses
 from vinetrack.diagnosis.ladder import candidates_of, first_that_counts
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference import optimiser, solving
+from vinetrack.inference import optimiser
 from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products
@@ -123,7 +123,7 @@ def test_a_fit_of_many_trials_begins_with_some_of_them_and_ends_where_one_of_all
     fits = []
     for some in (True, False):
         if not some:
-            monkeypatch.setattr(solving, "_part", lambda _: np.zeros(0, dtype=int))
+            monkeypatch.setattr(optimiser, "_part", lambda _: np.zeros(0, dtype=int))
         base = vt.fit(vt.base_model(), pairs)
         fits.append((base, vt.refit(base, base.model + "reservoir_depletion")))
     (base, fit), (_, reference) = fits

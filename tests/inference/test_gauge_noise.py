@@ -10,10 +10,9 @@ from lsoda_vine import as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import gauge_noise as gauge
-from vinetrack.inference import solving
 from vinetrack.inference.errors import with_systematics
 from vinetrack.inference.fit_data import prepare
-from vinetrack.inference.optimiser import FixedTerms
+from vinetrack.inference.optimiser import FixedTerms, solve_onward
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.tracks.position_noise import ar1_noise
@@ -302,7 +301,7 @@ def test_an_error_of_a_trace_is_estimated(fit):
     clock_s, pressure_Pa = data[which].trace
     data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 0]))
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    solution = solving.solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
+    solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
     after, place = with_systematics(moved, solution).solution.state, (which, N_TRIAL_EFFECTS)
     assert after.trial_effects[place] - fit.with_errors.trial_effects[place] == pytest.approx(-2.0, abs=0.5)
 
