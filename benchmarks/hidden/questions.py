@@ -173,7 +173,7 @@ def ask_bic(kind: str, seed: int, scatter: bool = True) -> Row:
             if effect.kind == "base" or effect.name == "static_yield":
                 continue
             try:
-                after = vt.refit(base, base.model + effect, hold_spreads=not scatter, hold_noise=not scatter)
+                after = vt.refit(base, base.model + effect, hold_variances=not scatter)
             except (FitError, EffectError):
                 continue
             scores[effect.name], chi2[effect.name] = _bic(after, points), -2 * after.log_likelihood

@@ -29,13 +29,12 @@ from vinetrack.inference.errors import assemble, student, trial_fit, trial_infor
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import whiten
-from vinetrack.inference.marginal_likelihood import FitState, matrix_root, trial_deviation_sd
+from vinetrack.inference.marginal_likelihood import matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import (
     CONVERGED_DECREASE,
     MOST_ITERATIONS,
     POOR_FIT,
     FixedTerms,
-    Solution,
     Watch,
     cost,
     first_state,
@@ -87,11 +86,11 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
-            loadings, random = _loadings_of_new_trial(fit, trial_data, trial)
+            variance = _variance_of_new_trial(fit, trial_data, trial)
         except (SimulationError, FitError):
             banded.append(trial)
             continue
-        variance = np.sum(loadings**2, axis=1) + random + (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
+        variance += (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
         banded.append(replace(trial, band_m=reach * np.sqrt(variance)))
     return banded
 
@@ -100,15 +99,14 @@ def _calibrated(fit: Fit) -> tuple[float, float]:
     """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel, and
     the half width of the band in standard deviations.
     """
-    solution, data = fit.solution, fit.predictor.data
-    known = trial_information(solution)
-    pairs = [_leave_one_out(solution, *known, data[i], i, fit.noise_correlation) for i in range(len(data))]
-    predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
+    solution, known = fit.solution, trial_information(fit.solution)
+    left_out = [(i, _leave_one_out(fit, *known, i)) for i in range(len(fit.trials))]
+    predictable = [(i, *pair) for i, pair in left_out if pair is not None]
     if not predictable:
         return 0.0, 1.96  # Standard normal quantile of 0.975 (derived)
     square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
-    travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
+    travel2 = np.array([np.ptp(fit.trials[i].lead_position_m) ** 2 for i, *_ in predictable])
     delta2 = _paule_mandel(square, mean_variance, travel2)
     assumed = delta2 == 0.0 and not any(solution.estimable)
     # Restricted likelihood loses a degree of freedom for each fitted parameter; δ loses one.
@@ -136,26 +134,19 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _leave_one_out(
-    solution: Solution, information: Floats, scores: Floats, trial_data: FitTrial, i: int, fit_correlation: float
-) -> tuple[Floats, Floats] | None:
+def _leave_one_out(fit: Fit, information: Floats, scores: Floats, i: int) -> tuple[Floats, Floats] | None:
     """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
     trials do not determine all parameters on which it depends.
     """
-    problem, state = solution.problem, solution.state
-    if (known := without(solution, information, scores, [i])) is None:
+    problem, state, columns = fit.solution.problem, fit.solution.state, fit.solution.columns[i]
+    if (known := without(fit.solution, information, scores, [i])) is None:
         return None
-    columns, deviations, (step, root) = solution.columns[i], [PRESSURE, DAMPING_DEVIATION], known
-    moved = design_matrix(columns, problem.index[i], step.size)
+    step, root = known
+    deviations, moved = [PRESSURE, DAMPING_DEVIATION], design_matrix(columns, problem.index[i], step.size)
     residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] - moved @ step
-    design = moved @ root
     own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
-    loadings = np.column_stack([design, _deviation_loadings(own_sd, columns, trial_data)])
     noise = float(state.variance[i]) / (1 - state.rho**2)
-    aligned, random, residual = _with_release_and_origin_fitted(
-        loadings, residual, columns[:, :2], trial_data, fit_correlation, state, noise
-    )
-    return residual, np.sum(aligned**2, axis=1) + random
+    return _aligned_error(fit, fit.predictor.data[i], columns, [moved @ root], own_sd, noise, residual)
 
 
 def design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
@@ -165,30 +156,19 @@ def design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
     return design[:, :size]
 
 
-def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:
-    """Displacement by one standard deviation of pressure, of B and of a set pressure, shape (n_points, 3)."""
-    set_pressure = trial_data.trace is None and spread[0] > 0 and trial_data.trial.pressure_Pa > 0
-    misset = PRESSURE_ERROR_PA / trial_data.trial.pressure_Pa if set_pressure else 0.0
-    moved = columns[:, [PRESSURE, DAMPING_DEVIATION, PRESSURE]]
-    return np.asarray(moved * [spread[0], spread[1], misset])
-
-
-def _loadings_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
-    """Displacement of a new trial by one standard deviation of each error, m, and the variance of its noise, m²."""
+def _variance_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> Floats:
+    """Variance of the deviation of a new trial from its prediction, m², shape (n_points,), without the discrepancy."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
     theta, places = values_for_trial(fit, layout, trial_data)
     predictor = Predictor(layout, [trial_data], fit.predictor.host)
-    trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
-    columns = predictor.linearise(theta, trial_effects)[0]
+    columns = predictor.linearise(theta, np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]]))[0]
     held = zip(fit.predictor.layout.free, fit.numbers, strict=True)
     slopes = np.array([free.derivative(number.value) for free, number in held])
-    covariance = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) / slopes[:, None] / slopes
-    parameter_covariance = np.diag(
-        np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0)
-    )
-    matched = np.flatnonzero(places >= 0)
-    parameter_covariance[matched, :] = parameter_covariance[:, matched] = 0.0
-    parameter_covariance[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
+    scaled = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) / slopes[:, None] / slopes
+    prior, matched = layout.prior_precision, np.flatnonzero(places >= 0)
+    covariance = np.diag(np.where(prior > 0, 1 / np.maximum(prior, 1e-300), 0.0))
+    covariance[matched, :] = covariance[:, matched] = 0.0
+    covariance[np.ix_(matched, matched)] = scaled[np.ix_(places[matched], places[matched])]
     design = design_matrix(columns, layout.index[0], theta.size)
     unknown = matched[~np.isfinite(np.diag(fit.covariance)[places[matched]])]
     # 1e-6: part of the travel by which a trial does not depend on a parameter (derived)
@@ -197,14 +177,10 @@ def _loadings_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> t
     state = fit.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]
-    shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
-    loadings = np.column_stack(
-        [design @ matrix_root(parameter_covariance), _deviation_loadings(spread, columns, trial_data), shapes]
-    )
+    shapes = position_shapes(predictor, [trial_data.lead_position_m - trial.origin_m - columns[:, -1]])[0]
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
-    return _with_release_and_origin_fitted(
-        loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise
-    )[:2]
+    loadings = [design @ matrix_root(covariance), shapes]
+    return _aligned_error(fit, trial_data, columns, loadings, spread, noise, columns[:, -1])[1]
 
 
 def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
@@ -221,31 +197,35 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
     return theta, places
 
 
-def _with_release_and_origin_fitted(
-    loadings: Floats,
-    residual: Floats,
-    design: Floats,
+def _aligned_error(
+    fit: Fit,
     trial_data: FitTrial,
-    fit_correlation: float,
-    state: FitState,
+    columns: Floats,
+    loadings: list[Floats],
+    deviation_sd: Floats,
     noise: float,
-) -> tuple[Floats, Floats, Floats]:
-    """Loadings, noise variance at each point, and residual after release and origin are fitted to the trial. `design`
-    holds the columns of release and origin, `fit_correlation` is the noise correlation with which predictions fit them,
-    `noise` the variance of a position, m².
+    residual: Floats,
+) -> tuple[Floats, Floats]:
+    """Residual and variance at each point after release and origin are fitted to the trial, as predictions fit them.
+    `loadings` are displacements by one standard deviation of further errors, (n_points, …), `deviation_sd` the standard
+    deviations of pressure and B, and `noise` is the variance of a position, m².
     """
-    points, rows = np.eye(residual.size), np.arange(residual.size)
-    whitener = whiten(points, trial_data.first, fit_correlation, trial_data.relative_sd)
+    trial, rho = trial_data.trial, fit.solution.state.rho
+    set_pressure = trial_data.trace is None and deviation_sd[0] > 0 and trial.pressure_Pa > 0
+    sizes = [*deviation_sd, PRESSURE_ERROR_PA / trial.pressure_Pa if set_pressure else 0.0]
+    moved = columns[:, [PRESSURE, DAMPING_DEVIATION, PRESSURE]] * sizes
+    points, rows, design = np.eye(residual.size), np.arange(residual.size), columns[:, :2]
+    whitener = whiten(points, trial_data.first, fit.noise_correlation, trial_data.relative_sd)
     white = whitener @ design
     fitted = np.array([not trial_data.pressurised_in_recording, True])
     inverse = np.linalg.pinv(white.T @ white * np.outer(fitted, fitted), rcond=1e-10, hermitian=True)
     left = points - design @ inverse @ (white.T @ whitener)
-    aligned = left @ np.column_stack([loadings, residual])
+    aligned = left @ np.column_stack([*loadings, moved, residual])
     # Stretches are independent.
     stretch, sd = np.cumsum(trial_data.first), trial_data.point_sd
-    correlation = np.where(stretch[:, None] == stretch, state.rho ** np.abs(rows[:, None] - rows), 0.0)
+    correlation = np.where(stretch[:, None] == stretch, rho ** np.abs(rows[:, None] - rows), 0.0)
     random = noise * np.sum((left @ (correlation * np.outer(sd, sd))) * left, axis=1)
-    return aligned[:, :-1], random, aligned[:, -1]
+    return aligned[:, -1], np.sum(aligned[:, :-1] ** 2, axis=1) + random
 
 
 # ------------------------------------------------------------------------------
@@ -257,22 +237,20 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     return aligned_to_trials(fit, data, from_rest=from_rest)[2]
 
 
-def predict_from_rest(model: Model, data: Sequence[FitTrial], host: Model) -> list[TrialFit]:
-    """Predict trials by a model of given sizes as `predict_prepared` does from rest, with noise of 1 m."""
-    return _aligned(model, data, host, 0.0, 1.0, from_rest=True)[2]
-
-
 def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], from_rest: bool) -> tuple[Predictor, Floats, list[TrialFit]]:
-    """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and the trials as predicted."""
-    data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
+    """`predict_by_model` under a fit, with its noise and its yield pressures."""
     rho = 0.0 if from_rest else fit.noise_correlation
+    data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
     variance = fit.noise_m**2 * (1 - rho**2)
-    return _aligned(fit.model, data, fit.predictor.host, rho, variance, from_rest=from_rest)
+    return predict_by_model(fit.model, data, fit.predictor.host, rho, variance, from_rest=from_rest)
 
 
-def _aligned(
+def predict_by_model(
     model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, variance: float, *, from_rest: bool
 ) -> tuple[Predictor, Floats, list[TrialFit]]:
+    """Predictor of trials, release and origin under a model of given sizes, (n_trials, 4), and the trials as predicted,
+    with the noise that scales their whitened residuals.
+    """
     try:
         base = np.array([model.parameters_of(trial_data.trial) for trial_data in data])
     except EffectError as error:
@@ -370,8 +348,7 @@ def refit(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] | None = None,
     start: Mapping[str, Value] | None = None,
-    hold_spreads: bool = False,
-    hold_noise: bool = False,
+    hold_variances: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     afresh: bool = False,
     least: float = -math.inf,
@@ -392,8 +369,8 @@ def refit(
         Differences between trials to estimate, in place of those of the previous fit.
     start : mapping, optional
         Starting values of parameters, mainly of a new effect: a time constant that starts at zero stays there.
-    hold_spreads, hold_noise : bool
-        Keep the between-trial standard deviations, or the noise, of the previous fit instead of estimating them again.
+    hold_variances : bool
+        Keep noise and between-trial standard deviations of the previous fit instead of estimating them again.
     most_iterations : int
         Maximum number of steps; a model that only has to be ruled out need not converge.
     afresh : bool
@@ -449,17 +426,14 @@ def refit(
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))
-    previous_state = before.state
-    fixed_terms = FixedTerms(
-        previous_state.spread if hold_spreads else None,
-        (previous_state.rho, previous_state.variance) if hold_noise else None,
-    )
+    state = before.state
+    held = FixedTerms(state.spread, (state.rho, state.variance)) if hold_variances else FixedTerms()
     how: dict[str, Any] = {"most_iterations": most_iterations, "least": least, "watch": watch}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
-            solution = solve_from(predictor, theta, fixed_terms, **how)
+            solution = solve_from(predictor, theta, held, **how)
         else:
-            solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
+            solution = solve_onward(predictor, before.solution, theta, held, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
     fitted = assemble(predictor, solution, before.left_out, {**options_used, "shared": shared_used})

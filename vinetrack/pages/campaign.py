@@ -23,7 +23,7 @@ from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.folder import Experiment
 from vinetrack.figures.registry import condition_labels
-from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
+from vinetrack.inference.fit import fit, predict_by_model, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, FitSummary, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import Step, Watch
@@ -198,7 +198,7 @@ def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
         for group in (trial.vine, trial.yield_group):
             yield_Pa = choice.numbers.get(f"{YIELD_PRESSURE}[{group}]", yield_Pa)
         data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
-    predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
+    *_, predicted = predict_by_model(sized_model(campaign, choice), data, campaign.host, 0.0, 1.0, from_rest=True)
     members = {name: [predicted[i] for i in campaign.indices_of_condition(name)] for name in campaign.conditions}
     errors_m = {name: rms_of(trials) for name, trials in members.items()}
     return Prediction(tuple(predicted), errors_m, rms_of(predicted))
