@@ -251,7 +251,7 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
     fit adds to σ² for scatter comes on top.
     """
     extended = with_systematics(fit.predictor, fit.solution).solution
-    plain = np.diag(precision(extended).first(len(fit.numbers)).covariance)
+    plain = np.diag(precision(extended).covariance)[: len(fit.numbers)]
     for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
         if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:

@@ -52,7 +52,7 @@ from vinetrack.inference.optimiser import (
     update_variances,
     variance_change,
 )
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor
 from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 
 # ------------------------------------------------------------------------------
@@ -66,23 +66,16 @@ LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence
 
 @dataclass(frozen=True)
 class Precision:
-    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones. `degrees`,
-    shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without influence on the
-    trajectories, `collinear` those of which only a combination with others is determined. `shared` is the part of the
-    variance that all trials share, by its source.
+    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones: `insensitive`
+    are those without influence on the trajectories, `collinear` those of which only a combination with others is
+    determined. `degrees` of freedom of the errors, and the part of the variance that all trials share, by its source.
     """
 
     covariance: Floats
-    degrees: Floats
     insensitive: np.ndarray
     collinear: np.ndarray
+    degrees: Floats = field(default_factory=lambda: np.empty(0))
     shared: Mapping[str, Floats] = field(default_factory=dict)
-
-    def first(self, count: int) -> Precision:
-        """The same of the first `count` parameters, the others integrated out."""
-        arrays = {name: getattr(self, name)[:count] for name in ("degrees", "insensitive", "collinear")}
-        shared = {name: variance[:count] for name, variance in self.shared.items()}
-        return Precision(self.covariance[:count, :count], shared=shared, **arrays)
 
 
 def precision(solution: Solution) -> Precision:
@@ -106,7 +99,7 @@ def precision(solution: Solution) -> Precision:
         covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
     unknown = np.flatnonzero(insensitive | collinear)
     covariance[unknown, unknown] = math.inf
-    return Precision(covariance, np.full(len(covariance), math.inf), insensitive, collinear)
+    return Precision(covariance, insensitive, collinear)
 
 
 def student(dof: Floats) -> Floats:
@@ -295,26 +288,30 @@ def scatter_variances(
 def widened_covariance(
     predictor: Predictor, solution: Solution, model_precision: Precision, sources: Sequence[str]
 ) -> Precision:
-    """Covariance and degrees of freedom at the end of a fit with its systematic errors, the last unknowns, widened by
-    the scatter of trials. `sources` are where each of these errors comes from.
+    """Covariance and degrees of freedom of the parameters of a fit with its systematic errors, the last unknowns, which
+    come from these sources, widened by the scatter of trials.
     """
     plain, variance, few = robust_variances(predictor, solution)
     diagonal = np.diag(plain)
     ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
     # Where the between-trial standard deviations are the usual ones, no trial had to tell them.
     degrees = np.where((ratio > 1) | any(solution.estimable), few, math.inf)
-    covariance = (
-        np.where(np.isfinite(model_precision.covariance), model_precision.covariance, 0.0) * ratio[:, None] * ratio
-    )
-    unknown = np.flatnonzero(~np.isfinite(np.diag(model_precision.covariance)))
-    covariance[unknown, unknown] = np.inf
+    covariance = model_precision.covariance
+    covariance = np.where(np.isfinite(covariance), ratio[:, None] * ratio, 1.0) * covariance
     source_of = np.array([""] * (len(plain) - len(sources)) + list(sources))
     shared = {source: part * ratio**2 for source, part in shared_parts(plain, source_of).items()}
     if solution.problem.own_errors:
         exact = _with_known_pressures(solution)
         known_by = np.diag(_covariance_by_noise(exact, trial_information(exact)[0]))
         shared["gauge"] = np.maximum(diagonal - known_by, 0.0) * ratio**2
-    return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
+    n = len(predictor.layout.free)
+    return Precision(
+        covariance[:n, :n],
+        model_precision.insensitive[:n],
+        model_precision.collinear[:n],
+        degrees[:n],
+        {source: part[:n] for source, part in shared.items()},
+    )
 
 
 def shared_parts(covariance: Floats, source_of: np.ndarray) -> dict[str, Floats]:
@@ -426,16 +423,18 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...
 
 
 # ------------------------------------------------------------------------------
-# Messages of a fit: warnings on its numbers, and notes on what was done to its data.
-
+# What a fit states: numbers, trials, and messages that warn of them or tell what was done to the data.
 
 SPREAD_NAMES = ("pressure", "B")
+ESTIMATES = tuple(entry.name for entry in fields(TrialEstimates))  # of each trial effect its value and its error
 
 
 def fit_messages(
     predictor: Predictor, solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
 ) -> tuple[Remark, ...]:
-    """Warnings on convergence, on each number and on the size of the residuals; notes on the data."""
+    """Warnings on convergence, on each number and on the size of the residuals; notes on unequal weights of points and
+    on positions that were smoothed before they were imported.
+    """
     told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
     for k, number in enumerate(numbers):
         named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
@@ -472,22 +471,13 @@ def fit_messages(
             largest = max(number.shared, key=lambda source: number.shared[source])
             by_source.setdefault(largest, []).append(number.title)
     told += [remark("mostly_shared", names=titles, source=source) for source, titles in by_source.items()]
-    return (*told, *_notes_on_data(predictor.data))
-
-
-def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
-    """Notes on points with unequal weights, on positions that were smoothed before they were imported, and on recorded
-    pressures that the fit corrected.
-    """
-    notes = []
-    weighted = [each for each in data if np.ptp(each.point_sd[: each.time_s.size - each.sees_end]) > 0]
+    weighted = [each for each in predictor.data if np.ptp(each.point_sd[: each.time_s.size - each.sees_end]) > 0]
     if weighted and weighted[0].blur_s > 0:
-        notes.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
+        told.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
     elif weighted:
-        notes.append(remark("weighted_as_stated"))
-    smoothed = dict.fromkeys(trial_data.smoothing for trial_data in data if trial_data.smoothing is not None)
-    notes += [remark("smoothed", how=str(one), frames=one.decimation) for one in smoothed]
-    return notes
+        told.append(remark("weighted_as_stated"))
+    smoothed = dict.fromkeys(each.smoothing for each in predictor.data if each.smoothing is not None)
+    return (*told, *(remark("smoothed", how=str(one), frames=one.decimation) for one in smoothed))
 
 
 def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, str], options: Mapping[str, Any]) -> Fit:
@@ -496,20 +486,16 @@ def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, st
     with_errors = with_systematics(predictor, solution)
     extended, count = with_errors.solution, len(layout.free)
     by_noise = precision(extended)
-    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources).first(count)
-    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit)
+    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources)
+    numbers = _numbers(predictor, extended.state.theta, precision_of_fit)
     slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     chi2 = chi2_per_dof(predictor, solution)
     points, state = solution.problem.points, extended.state
     variance = float(np.average(state.variance, weights=points)) / (1 - state.rho**2)
     # Yield pressures belong to the trials and stay in the numbers.
-    values = [
-        (number.key, number.vine, number.value)
-        for number in numbers
-        if number.key != YIELD_PRESSURE and layout.term(number.key) is None
-    ]
+    of_model = [each for each in numbers if each.key != YIELD_PRESSURE and layout.term(each.key) is None]
     return Fit(
-        model=layout.model.with_values(values_by_key(values)),
+        model=layout.model.with_values(values_by_key((each.key, each.vine, each.value) for each in of_model)),
         numbers=numbers,
         covariance=precision_of_fit.covariance * slopes[:, None] * slopes,
         spreads={
@@ -533,36 +519,30 @@ def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, st
     )
 
 
-def _numbers(
-    predictor: Predictor, solution: Solution, theta: Floats, precision_of_fit: Precision
-) -> tuple[Number, ...]:
+def _numbers(predictor: Predictor, theta: Floats, precision_of_fit: Precision) -> tuple[Number, ...]:
     """The free parameters, the first entries of `theta`, with their errors and intervals."""
-    layout, problem = predictor.layout, solution.problem
-    sigma = np.sqrt(np.diag(precision_of_fit.covariance))
-    dof = precision_of_fit.degrees
-    reach = student(dof)
-    numbers = []
-    for k, number in enumerate(layout.free):
-        low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
-        if not math.isfinite(sigma[k]):
-            low, high, method = problem.lower[k], problem.upper[k], "none"
-        low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
-        at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
-        slope = number.derivative(number.from_scaled(float(theta[k])))
+    numbers, dof = [], precision_of_fit.degrees
+    sigmas = np.sqrt(np.diag(precision_of_fit.covariance))
+    of_parameters = zip(predictor.layout.free, *predictor.layout.bounds, theta.tolist(), strict=False)
+    for k, (free, lower, upper, at) in enumerate(of_parameters):
+        reach, sigma = student(dof)[k] * sigmas[k], float(sigmas[k])
+        low, high = (at - reach, at + reach) if math.isfinite(sigma) else (-math.inf, math.inf)
+        ends = [end for end in (lower, upper) if abs(at - end) <= 1e-9 * max(abs(end), 1.0)]
+        slope = free.derivative(free.from_scaled(at))
         shared = {name: math.sqrt(v[k]) * slope for name, v in precision_of_fit.shared.items() if v[k] > 0}
         numbers.append(
             Number(
-                **{name: getattr(number, name) for name in ("key", "vine", "symbol", "unit")},
-                value=number.from_scaled(float(theta[k])),
-                sigma=float(sigma[k]) * slope,
-                low=number.from_scaled(float(low)),
-                high=number.from_scaled(float(high)),
+                *(free.key, free.vine, free.symbol, free.unit),
+                value=free.from_scaled(at),
+                sigma=sigma * slope,
+                low=free.from_scaled(float(max(low, lower))),
+                high=free.from_scaled(float(min(high, upper))),
                 dof=float(dof[k]),
-                method=method,
-                bound=number.from_scaled(float(at[0])) if at else math.nan,
-                lower=number.from_scaled(float(problem.lower[k])),
-                upper=number.from_scaled(float(problem.upper[k])),
-                shared=shared if math.isfinite(sigma[k]) else {},
+                method="linear" if math.isfinite(sigma) else "none",
+                bound=free.from_scaled(float(ends[0])) if ends else math.nan,
+                lower=free.from_scaled(float(lower)),
+                upper=free.from_scaled(float(upper)),
+                shared=shared if math.isfinite(sigma) else {},
                 pressure_unit=predictor.data[0].trial.pressure_unit,
             )
         )
@@ -616,9 +596,10 @@ def trial_fit(
     """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
     velocity_m_s (n_points,).
     """
-    sigma = np.full(N_TRIAL_EFFECTS, math.nan) if sigma is None else sigma
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m
+    effects = [*trial_effects[:DAMPING_DEVIATION], math.expm1(trial_effects[DAMPING_DEVIATION])]
+    stated = np.column_stack([effects, np.full(N_TRIAL_EFFECTS, math.nan) if sigma is None else sigma])
     return TrialFit(
         trial=trial_data.trial,
         time_s=trial_data.time_s,
@@ -627,21 +608,13 @@ def trial_fit(
         predicted_velocity_m_s=velocity_m_s,
         residual_m=residual_m,
         whitened=whiten(residual_m, trial_data.first, rho, trial_data.relative_sd) / math.sqrt(variance),
-        release_s=float(trial_effects[RELEASE]),
-        release_sigma_s=float(sigma[RELEASE]),
-        origin_m=float(trial_effects[ORIGIN]),
-        origin_sigma_m=float(sigma[ORIGIN]),
-        pressure_deviation=float(trial_effects[PRESSURE]),
-        pressure_deviation_sigma=float(sigma[PRESSURE]),
-        damping_deviation=math.expm1(trial_effects[DAMPING_DEVIATION]),
-        damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
         noise_m=math.sqrt(variance / (1 - rho**2)),
+        **dict(zip(ESTIMATES, stated.ravel().tolist(), strict=True)),
     )
 
 
 def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
     """The summary of a fit."""
-    keys = [entry.name for entry in fields(TrialEstimates)]
     moved = film_influence(fit)
     same = "numbers covariance spreads noise_m noise_correlation chi2_per_dof log_likelihood converged left_out"
     return FitSummary(
@@ -650,5 +623,5 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         moved_by_film=moved,
         messages=tuple(map(str, (*fit.messages, *film_messages(fit.numbers, moved), *further_messages))),
         warnings=tuple(warnings),
-        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
+        trials={trial.name: TrialEstimates(*(getattr(trial, name) for name in ESTIMATES)) for trial in fit.trials},
     )

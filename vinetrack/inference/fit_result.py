@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
@@ -118,10 +119,8 @@ class ParameterMap:
     @property
     def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds, scaled, shape (n_free,) each."""
-        return (
-            np.array([number.to_scaled(number.lower) for number in self.free]),
-            np.array([number.to_scaled(number.upper) for number in self.free]),
-        )
+        lower = np.array([number.to_scaled(number.lower) for number in self.free])
+        return lower, np.array([number.to_scaled(number.upper) for number in self.free])
 
     @property
     def prior_precision(self) -> Floats:
@@ -179,8 +178,8 @@ def make_layout(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] = (),
 ) -> ParameterMap:
-    """Choose the free parameters of a fit and map them to the trials. By default every parameter of every effect is
-    free, except those that are `held` (g), and so is the yield pressure of each vine within the error in the sheet.
+    """The free parameters of a fit, and which trials they apply to: by default all of every effect that are not `held`
+    (g), and the yield pressure of each vine within the error in the sheet.
     """
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
     names = [*parameters, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
@@ -190,15 +189,14 @@ def make_layout(
     for name, how in sharing_by_name.items():
         if how not in ("all", "vine", "day"):
             raise FitError(f"{name} is shared by {how!r}: say 'all', 'vine' or 'day'.")
-    free_names = [
-        name for name in parameters if name not in fixed_names and (name in freed_names or not parameters[name].held)
-    ]
+    held = fixed_names.union(name for name, one in parameters.items() if one.held and name not in freed_names)
+    keys = [name for name in parameters if name not in held]
     trials = [trial_data.trial for trial_data in data]
     base = np.array([model.parameters_of(trial) for trial in trials])
     base = base.reshape(len(data), len(model.parameter_names))
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
-    for name in free_names:
+    for name in keys:
         how = sharing_by_name.get(name, parameters[name].shared)
         groups, members = groups_of(trials, how), group_names(trials, how)
         places = {group: len(numbers) + i for i, group in enumerate(members)}
@@ -206,7 +204,6 @@ def make_layout(
             _free_parameter(name, parameters[name], group, base[groups.index(group)], model) for group in members
         ]
         index = np.column_stack([index, [places[group] for group in groups]])
-    keys = list(free_names)
     if YIELD_PRESSURE in names and YIELD_PRESSURE not in fixed_names:
         yield_numbers, column = _yield_pressures(data, len(numbers))
         if yield_numbers:
@@ -214,12 +211,8 @@ def make_layout(
     for term in between:
         members = [group for group in dict.fromkeys(term.groups) if group]
         place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
-        numbers += [
-            FreeParameter(
-                term.key, group, term.symbol, term.unit, 0.0, -math.inf, math.inf, term.scale, prior_sd=term.prior_sd
-            )
-            for group in members
-        ]
+        shown = (term.symbol, term.unit, 0.0, -math.inf, math.inf, term.scale, term.prior_sd)
+        numbers += [FreeParameter(term.key, group, *shown) for group in members]
         keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
     return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
 
@@ -256,51 +249,34 @@ def _free_parameter(name: str, parameter: Parameter, vine: str, values: Floats, 
     value = float(values[model.parameter_names.index(name)])
     low, high = parameter.plausible or parameter.bounds
     width = high - low if math.isfinite(high - low) else max(abs(parameter.default), 1.0)
-    further_starts = (low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else ()
     return FreeParameter(
-        key=name,
-        vine=vine,
-        symbol=parameter.symbol,
-        unit=parameter.unit,
-        start=float(np.clip(value, *parameter.bounds)),
-        lower=parameter.bounds[0],
-        upper=parameter.bounds[1],
+        name,
+        vine,
+        parameter.symbol,
+        parameter.unit,
+        float(np.clip(value, *parameter.bounds)),
+        *parameter.bounds,
         scale=max(abs(value), 0.3 * width) or 1.0,
-        further_starts=further_starts,
+        further_starts=(low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else (),
         logarithmic=name == DAMPING,
     )
 
 
 def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreeParameter], NDArray[np.int_]]:
     """One yield pressure for each vine and stated value, with the error in the sheet as prior."""
-    numbers: list[FreeParameter] = []
-    places: dict[tuple[str, float], int] = {}
+    numbers: dict[tuple[str, float], FreeParameter] = {}
     column = np.full(len(data), -1)
-    stated = {(trial_data.trial.vine, round(trial_data.trial.yield_pressure_Pa, 3)) for trial_data in data}
-    several = {vine for vine, _ in stated if sum(vine == other for other, _ in stated) > 1}
-    for i, trial_data in enumerate(data):
-        trial = trial_data.trial
+    values = {(each.trial.vine, round(each.trial.yield_pressure_Pa, 3)) for each in data}
+    count = Counter(vine for vine, _ in values)
+    for i, trial in enumerate(each.trial for each in data):
         sigma_Pa, stated_Pa = trial.yield_pressure_sigma_Pa, trial.yield_pressure_Pa
         if trial.travel_ratio == 1 or not (math.isfinite(sigma_Pa) and sigma_Pa > 0 and math.isfinite(stated_Pa)):
             continue
-        place = (trial.vine, round(stated_Pa, 3))
-        if place not in places:
-            places[place] = offset + len(numbers)
-            numbers.append(
-                FreeParameter(
-                    key=YIELD_PRESSURE,
-                    vine=trial.yield_group if trial.vine in several else trial.vine,
-                    symbol="P_y",
-                    unit="Pa",
-                    start=stated_Pa,
-                    lower=0.0,
-                    upper=math.inf,
-                    scale=max(stated_Pa, 1e3),
-                    prior_sd=sigma_Pa,
-                )
-            )
-        column[i] = places[place]
-    return numbers, column
+        place, group = (trial.vine, round(stated_Pa, 3)), trial.yield_group if count[trial.vine] > 1 else trial.vine
+        how = (YIELD_PRESSURE, group, "P_y", "Pa", stated_Pa, 0.0, math.inf, max(stated_Pa, 1e3), sigma_Pa)
+        numbers.setdefault(place, FreeParameter(*how))
+        column[i] = offset + list(numbers).index(place)
+    return list(numbers.values()), column
 
 
 OrNaN = Annotated[float, BeforeValidator(or_nan)]  # A number of a JSON file, where null means that it is not known
@@ -313,9 +289,8 @@ def or_open(end: float) -> BeforeValidator:
 
 @dataclass(frozen=True)
 class Number(JsonRecord):
-    """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
-    number applies to all. `method` is `linear`, or `none` if the data do not determine it. `shared` is the part of the
-    standard error from what all trials share, by its source.
+    """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `method` is `linear`, or
+    `none` if the data do not determine it; `shared` is the part of the error that all trials share, by its source.
     """
 
     key: Annotated[str, Field(alias="parameter")]
@@ -490,17 +465,6 @@ class Fit(NumberTable, Drawn):
     def names(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the effects of the model, in order."""
         return self.model.names
-
-    def positions(self) -> pd.DataFrame:
-        """Measured and predicted positions of all trials, one row per point."""
-        import pandas as pd
-
-        columns = ("time_s", "lead_position_m", "predicted_position_m", "residual_m")
-        parts = [
-            pd.DataFrame({"trial": trial.name, **{column: getattr(trial, column) for column in columns}})
-            for trial in self.trials
-        ]
-        return pd.concat(parts, ignore_index=True)
 
     def __repr__(self) -> str:
         return f"Fit({' + '.join(self.model.names)}; {len(self.trials)} trials)"
