@@ -51,7 +51,6 @@ EXACT_TOLERANCE = 1e-9
 # Fraction of samples on a line through two others above which a trace counts as interpolated (chosen)
 INTERPOLATED_PART = 0.25
 
-
 NEGLIGIBLE_NOISE = 1e-4  # Noise below this fraction of the median pressure is rounding, and is not removed (chosen)
 
 FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (derived)
@@ -59,9 +58,7 @@ FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (
 # Least number of blocks into which a trace in coarse steps is divided, and least number of samples in each (chosen)
 FEWEST_BLOCKS = 4
 
-
 NOISE_DEGREES = 2 / 4.62  # Degrees of freedom of the noise variance per sample (derived)
-
 
 COMPARED_LAG = 4  # Lag at which noise is compared with that of neighbouring readings (chosen)
 
@@ -77,9 +74,8 @@ class GaugeNoise:
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of a gauge during a trace, Pa, and their places, in samples from the first; both of shape (n,).
-    `rounding_Pa` is the standard deviation of the rounding error, 0 where nothing is rounded. With `edges` they are
-    means of the samples between these, and rounding is all their noise.
+    """Readings of a gauge during a trace, Pa, and their places, in samples from the first; standard deviation of their
+    rounding error. With `edges` they are means of the samples between these, and rounding is all their noise.
     """
 
     places: Floats
@@ -89,9 +85,7 @@ class Readings:
 
 
 def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
-    """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held. Shapes: traces
-    (n,).
-    """
+    """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held."""
     found = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
     scatter_digits = [digits for *_, digits in filter(None, found)]
     # Samples rounded to steps coarser than their noise lie on lines for that reason alone.
@@ -130,15 +124,12 @@ def _interpolated_readings(pressure_Pa: Floats) -> tuple[Floats, Floats, float] 
     """Places and values of the readings of an interpolated or held trace and their scatter in last digits; None if it
     is neither.
     """
-    steps = np.abs(np.diff(pressure_Pa))
+    steps, digit_Pa = np.abs(np.diff(pressure_Pa)), _resolution(pressure_Pa)
     if pressure_Pa.size < 4 or not steps.any():
         return None
-    digit_Pa = _resolution(pressure_Pa)
-    if (
-        np.mean(steps == 0.0) > INTERPOLATED_PART
-        and (held_readings := _sample_and_hold_readings(pressure_Pa, digit_Pa)) is not None
-    ):
-        return *held_readings, math.inf
+    still = np.mean(steps == 0.0) > INTERPOLATED_PART
+    if still and (held := _sample_and_hold_readings(pressure_Pa, digit_Pa)) is not None:
+        return *held, math.inf
     begins = _straight_runs(pressure_Pa, max(0.5 * digit_Pa, EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa)))))
     within = np.diff(begins, append=pressure_Pa.size) - 2
     if begins.size == 1 or np.sum(np.maximum(within, 0)) < INTERPOLATED_PART * pressure_Pa.size:
@@ -195,10 +186,9 @@ def _sample_and_hold_readings(pressure_Pa: Floats, digit_Pa: float) -> tuple[Flo
         if places.size > 2:
             places[0] = min(0.0, places[1] - float(np.median(np.diff(places)[1:])))
         return places, pressure_Pa[[0, *changes]]
-    period_found = _sampling_period(changes.astype(float) - 0.5)
-    if period_found is None:
+    if (found := _sampling_period(changes.astype(float) - 0.5)) is None:
         return None
-    first, period = period_found
+    first, period = found
     places = np.arange(first - math.ceil(first / period) * period, pressure_Pa.size - 1.0, period)
     middle = np.clip(np.round(places + 0.5 * period), 0, pressure_Pa.size - 1).astype(int)
     return places, pressure_Pa[middle]
@@ -218,12 +208,9 @@ def _sampling_period(instants: Floats) -> tuple[float, float] | None:
         period = float(np.sum(gaps[short_gaps]) / np.sum(np.round(gaps[short_gaps] / period)))
     periods = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
     slope, first = np.polyfit(periods, instants, 1)
-    largest_error = np.max(np.abs(instants - first - slope * periods))
-    if largest_error > period_tolerance or gaps.size * math.log(slope / (2 * period_tolerance)) < -math.log(
-        period_false_alarm
-    ):
-        return None
-    return float(first), float(slope)
+    uneven = np.max(np.abs(instants - first - slope * periods)) > period_tolerance
+    by_chance = gaps.size * math.log(slope / (2 * period_tolerance)) < -math.log(period_false_alarm)
+    return None if uneven or by_chance else (float(first), float(slope))
 
 
 def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -240,13 +227,10 @@ def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[
     places, values = [], []
     for begin, (slope, at_0), (next_slope, next_at_0) in zip(begins[1:], lines, lines[1:], strict=False):
         intersection = (next_at_0 - at_0) / (slope - next_slope) if slope != next_slope else begin - 0.5
-        place = float(np.clip(intersection, begin - 1, begin))
-        places.append(place)
-        values.append(0.5 * (slope * place + at_0 + next_slope * place + next_at_0))
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
-    last = pressure_Pa.size - 1.0
-    ends = []
-    for inner, end, (slope, at_0) in ((places[0], 0.0, lines[0]), (places[-1], last, lines[-1])):
+        places.append(float(np.clip(intersection, begin - 1, begin)))
+        values.append(0.5 * ((slope + next_slope) * places[-1] + at_0 + next_at_0))
+    spacing, ends = float(np.median(np.diff(places))) if len(places) > 1 else 0.0, []
+    for inner, end, (slope, at_0) in ((places[0], 0.0, lines[0]), (places[-1], pressure_Pa.size - 1.0, lines[-1])):
         shown_length = abs(end - inner)
         # A line longer than the typical spacing contains a further reading.
         place = inner + math.copysign(max(spacing, shown_length), end - inner)
@@ -259,7 +243,7 @@ def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[
 
 def white_noise_sd(pressure_Pa: Floats) -> float:
     """Standard deviation of white noise on a smooth curve, from third differences; their variance is 20 σ². Differences
-    beyond three standard deviations, such as at a corner, are clipped (Winsorised). Shapes: pressure_Pa (n,).
+    beyond three standard deviations, such as at a corner, are clipped (Winsorised).
     """
     third = np.diff(pressure_Pa, 3) / math.sqrt(20)
     sigma = rough_noise(pressure_Pa)
@@ -272,10 +256,12 @@ def white_noise_sd(pressure_Pa: Floats) -> float:
 
 def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise]:
     """Noise of every trace, shrunk towards that of other traces of the gauge; 0 if negligible or undetermined."""
-    own_sigma = [math.nan] * len(readings)
-    for i, each in enumerate(readings):
-        if each.values_Pa.size >= FEWEST_SAMPLES and each.edges is None:
-            own_sigma[i] = white_noise_sd(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
+    own_sigma = [
+        white_noise_sd(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
+        if each.values_Pa.size >= FEWEST_SAMPLES and each.edges is None
+        else math.nan
+        for each in readings
+    ]
     known_sigmas = [sigma for sigma in own_sigma if sigma > 0]
     typical = float(np.median(known_sigmas)) if len(known_sigmas) > 1 else 0.0
     noises = []
@@ -328,9 +314,7 @@ def noise_correlations(traces: Sequence[Floats]) -> list[float]:
 
 
 def whitened(values: Floats, rho: float) -> Floats:
-    """Readings, or columns of curves through them, whitened for noise of the given lag-one correlation. Shapes: values
-    (n,).
-    """
+    """Readings, or columns of curves through them, whitened for noise of the given lag-one correlation."""
     return whiten(values, np.arange(len(values)) == 0, rho)
 
 
@@ -344,9 +328,8 @@ TIME_SPLINES, GROWTH_SPLINES = 24, 12  # Splines over the time of a trace and ov
 
 @dataclass(frozen=True)
 class DenoisedTrace:
-    """A recorded pressure without its noise, s and Pa, shape (n,), with its remaining errors. `mean_error_Pa` is the
-    standard deviation of its mean, 0 where the trace was left unchanged. The columns of `errors_Pa`, shape (n,
-    n_errors), are one standard deviation each of the other errors of the curve.
+    """A recorded pressure without its noise, shape (n,): standard deviation of its mean, 0 where the trace was left
+    unchanged, and one of each other error of the curve, columns of shape (n, n_errors).
     """
 
     time_s: Floats
@@ -357,7 +340,6 @@ class DenoisedTrace:
     def extended(self) -> DenoisedTrace:
         """The trace with one more sample beyond its end, along the line through its last part. If the clock of the
         gauge is behind that of the camera, the last frames were filmed under a pressure that was not recorded any more.
-        A constant extrapolation of a falling pressure would bias a fit of the clock offset.
         """
         last_s, span_s = self.time_s[-1], np.ptp(self.time_s)
         # 0.1, 0.2: last part of a trace whose line extrapolates it, and by how much (measured)
@@ -365,17 +347,12 @@ class DenoisedTrace:
         if np.count_nonzero(late) < 2:
             return self
         curves = np.column_stack([self.pressure_Pa, self.errors_Pa])
-        slope = np.polyfit(self.time_s[late] - last_s, curves[late], 1)[0]
         beyond_s = 0.2 * span_s
-        end = curves[-1] + slope * beyond_s
+        end = curves[-1] + np.polyfit(self.time_s[late] - last_s, curves[late], 1)[0] * beyond_s
         # A falling gauge pressure does not fall below zero.
         end[0] = max(end[0], min(curves[-1, 0], 0.0))
-        return replace(
-            self,
-            time_s=np.append(self.time_s, last_s + beyond_s),
-            pressure_Pa=np.append(self.pressure_Pa, end[0]),
-            errors_Pa=np.vstack([self.errors_Pa, end[1:]]),
-        )
+        curves = np.vstack([curves, end])
+        return DenoisedTrace(np.append(self.time_s, last_s + beyond_s), curves[:, 0], self.mean_error_Pa, curves[:, 1:])
 
     def thinned(self) -> DenoisedTrace:
         """The samples from which lines give all others, since a simulation stops at each (Ramer, Computer Graphics and
@@ -394,9 +371,7 @@ class DenoisedTrace:
                 kept.add(farthest)
                 spans += [(begin, farthest), (farthest, end)]
         places = sorted(kept)
-        return replace(
-            self, time_s=self.time_s[places], pressure_Pa=self.pressure_Pa[places], errors_Pa=self.errors_Pa[places]
-        )
+        return DenoisedTrace(self.time_s[places], curves[places, 0], self.mean_error_Pa, curves[places, 1:])
 
 
 @dataclass(frozen=True)
@@ -525,45 +500,44 @@ def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
 
 def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
     """Recorded pressures of the trials of a campaign without gauge noise; None for trials without a trace."""
-    denoised: list[DenoisedTrace | None] = [None] * len(tracks)
-    growths: dict[int, Growth | None] = {}
+    raw: dict[int, DenoisedTrace] = {}
+    growths: list[Growth | None] = []
     for i, track in enumerate(tracks):
-        known = np.zeros(0, dtype=bool)
-        if track.pressure_Pa is not None:
-            known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-        if track.pressure_Pa is None or np.count_nonzero(known) < 2:
+        if track.pressure_Pa is None:
+            continue
+        known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+        if np.count_nonzero(known) < 2:
             continue
         time_s, pressure_Pa = track.time_s[known].astype(float), track.pressure_Pa[known].astype(float)
-        denoised[i] = DenoisedTrace(time_s, pressure_Pa, 0.0, np.zeros((time_s.size, 0)))
+        raw[i] = DenoisedTrace(time_s, pressure_Pa, 0.0, np.zeros((time_s.size, 0)))
         in_track = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
-        growths[i] = None
+        growths.append(None)
         if np.count_nonzero(in_track) > 1:
             grown_m = np.interp(time_s, track.time_s[in_track], track.lead_position_m[in_track])
-            growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
-    raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
-    read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
+            growths[-1] = Growth(grown_m, float(np.median(np.diff(time_s))))
+    places, traces = list(raw), list(raw.values())
+    read = gauge_readings([trace.pressure_Pa for trace in traces])
     correlations = noise_correlations([readings.values_Pa for readings in read if readings.edges is None])
     noises = [noise_of_traces(read, rho) for rho in correlations]
-    noisy = [k for k, of_trace in enumerate(zip(*noises, strict=True)) if min(each.sigma_Pa for each in of_trace) > 0]
-    if not noisy:
-        return denoised
-    places = list(raw)
-    recorded = [
-        [Recorded(read[k], raw[places[k]].time_s.size, of_all[k], growths[places[k]]) for k in noisy]
-        for of_all in noises
-    ]
-    # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides, that of
-    # traces which curves explain.
-    clock = gauge_clock(recorded[0])
-    excess = Curves(recorded[0], clock).excess
-    telling = np.flatnonzero((excess <= 1) | (excess.min() > 1)).tolist()
-    possible = (Curves([of_all[k] for k in telling], clock) for of_all in recorded)
-    curves = max(possible, key=lambda each: each.log_likelihood)
-    smooth = {k: curve for k, curve, excess in zip(telling, curves.all(), curves.excess, strict=True) if excess <= 1}
-    for k, trace in enumerate(recorded[0]):
-        i = places[noisy[k]]
-        denoised[i] = DenoisedTrace(raw[i].time_s, *(smooth[k] if k in smooth else _splined(trace, clock)))
-    return denoised
+    noisy = [k for k in range(len(read)) if min(of_all[k].sigma_Pa for of_all in noises) > 0]
+    if noisy:
+        recorded = [
+            [Recorded(read[k], traces[k].time_s.size, of_all[k], growths[k]) for k in noisy] for of_all in noises
+        ]
+        # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides, that
+        # of traces which curves explain.
+        clock = gauge_clock(recorded[0])
+        excess = Curves(recorded[0], clock).excess
+        telling = np.flatnonzero((excess <= 1) | (excess.min() > 1)).tolist()
+        possible = (Curves([of_all[k] for k in telling], clock) for of_all in recorded)
+        curves = max(possible, key=lambda each: each.log_likelihood)
+        smooth = {
+            k: curve for k, curve, excess in zip(telling, curves.all(), curves.excess, strict=True) if excess <= 1
+        }
+        for k, (place, trace) in enumerate(zip(noisy, recorded[0], strict=True)):
+            quiet = smooth[k] if k in smooth else _splined(trace, clock)
+            raw[places[place]] = DenoisedTrace(traces[place].time_s, *quiet)
+    return [raw.get(i) for i in range(len(tracks))]
 
 
 class Curves:
@@ -580,9 +554,8 @@ class Curves:
         explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
         left = squares - np.sum(self.found.mean * explained, axis=1)
         degrees = np.array([trace.readings.values_Pa.size - 1 for trace in traces])
-        of_noise = [trace.noise.degrees for trace in traces]
         # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
-        largest = degrees * fdtri(degrees, of_noise, 1 - 1e-5)
+        largest = degrees * fdtri(degrees, [trace.noise.degrees for trace in traces], 1 - 1e-5)
         # None where the scale of curves ends
         ends = [np.min(trace.readings.values_Pa) < -0.9 * AMBIENT_PRESSURE_PA for trace in traces]
         self.excess = left / np.where(ends, 1e-300, largest)

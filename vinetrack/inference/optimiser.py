@@ -58,21 +58,16 @@ from vinetrack.inference.sensitivity import (
 def subset(
     predictor: Predictor, problem: MixedProblem, rows: NDArray[np.int_], *states: FitState
 ) -> tuple[Predictor, MixedProblem, list[FitState]]:
-    """Predictor, with the finite-difference steps of the other, problem and states of some trials and of the parameters
-    that apply to one of them; names, scales and priors are unchanged.
-    """
+    """Predictor, problem and states of some trials and of the parameters that apply to one of them."""
     whole = predictor.layout
-    places = np.unique(whole.index[rows])
-    places = places[places >= 0]
-    new_index = np.full(len(whole.free) + 1, -1)
-    new_index[places] = np.arange(places.size)
-    index = new_index[whole.index[rows]]
+    places = np.unique(whole.index[rows][whole.index[rows] >= 0])
+    index = np.where(whole.index[rows] >= 0, np.searchsorted(places, whole.index[rows]), -1)
     columns = np.flatnonzero((index >= 0).any(axis=0))
     layout = replace(
         whole,
         free=tuple(whole.free[place] for place in places),
         keys=tuple(whole.keys[column] for column in columns),
-        index=index[:, columns].astype(int),
+        index=index[:, columns],
         base=whole.base[rows],
         between=tuple(
             replace(term, groups=tuple(term.groups[row] for row in rows), regressor=term.regressor[rows])
@@ -92,11 +87,16 @@ def subset(
         **{name: getattr(problem, name)[rows] for name in by_trial.split()},
         **{name: getattr(problem, name)[places] for name in by_parameter.split()},
     )
-    reduced = [
-        replace(each, theta=each.theta[places], trial_effects=each.trial_effects[rows], variance=each.variance[rows])
-        for each in states
-    ]
-    return smaller, problem, reduced
+    return (
+        smaller,
+        problem,
+        [
+            replace(
+                each, theta=each.theta[places], trial_effects=each.trial_effects[rows], variance=each.variance[rows]
+            )
+            for each in states
+        ],
+    )
 
 
 # ------------------------------------------------------------------------------
@@ -161,14 +161,10 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
         return None
     releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
     jobs = predictor.jobs(state.theta, state.trial_effects)[places]
-    trial_effects, (centre, precision) = state.trial_effects.copy(), trial_effect_prior(problem, state)
-    for i, candidates_s, sensitivity in zip(
-        places, releases, _release_sensitivities(predictor, jobs, releases), strict=True
-    ):
-        noise = state.rho, float(state.variance[i])
-        effects, gain = _best_release(
-            predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
-        )
+    trial_effects, prior = state.trial_effects.copy(), np.stack(trial_effect_prior(problem, state), axis=1)
+    sensitivities = _release_sensitivities(predictor, jobs, releases)
+    for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
+        effects, gain = _best_release(predictor.data[i], i, state, prior[i], candidates_s, *sensitivity)
         if gain > LEAST_DECREASE:
             trial_effects[i] = effects
     rows = np.flatnonzero((trial_effects != state.trial_effects).any(axis=1))
@@ -179,44 +175,35 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
     # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
     for _ in range(3):
         proposed = optimise_trial_effects(predictor, problem, proposed)[0]
-    better = (
-        _trial_deviances(predictor, problem, proposed) < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
-    )
+
+    def deviances(state: FitState) -> Floats:
+        """−2 ln L of each trial, its effects integrated out by the Laplace approximation."""
+        columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
+        square = whitened_products(predictor.products(columns), state)[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
+        log_volume = np.linalg.slogdet(with_diagonal(square, trial_effect_prior(problem, state)[1]))[1]
+        return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
+
+    better = deviances(proposed) < deviances(current) - LEAST_DECREASE
     trial_effects = state.trial_effects.copy()
     trial_effects[rows[better]] = proposed.trial_effects[better]
     return replace(state, trial_effects=trial_effects) if better.any() else None
 
 
-def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
-    """−2 ln L of each trial, its effects integrated out by the Laplace approximation, shape (n_trials,)."""
-    columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-    square = whitened_products(predictor.products(columns), state)[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
-    log_volume = np.linalg.slogdet(with_diagonal(square, trial_effect_prior(problem, state)[1]))[1]
-    return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
-
-
 def _best_release(
-    trial_data: FitTrial,
-    trial_effects: Floats,
-    prior: tuple[Floats, Floats],
-    noise: tuple[float, float],
-    releases: Floats,
-    times: Floats,
-    plain: Floats,
-    sensitivities: Floats,
-) -> tuple[Floats, float]:
-    """Effects of one trial at its likeliest release, and the decrease of −2 ln L from the last of the releases. `prior`
-    are mean and precision of its effects, `noise` the correlation and the variance of the innovations.
+    trial_data: FitTrial, i: int, state: FitState, prior: Floats, releases: Floats,
+    times: Floats, plain: Floats, sensitivities: Floats,
+) -> tuple[Floats, float]:  # fmt: skip
+    """Effects of trial i at its likeliest release, and the decrease of −2 ln L from the last of the releases. `prior`
+    are mean and precision of its effects.
     """
-    centre, precision = prior
-    rho, variance = noise
+    trial_effects, (centre, precision) = state.trial_effects[i], prior
     # Sensitivities and residual at every point for each release, shape (n_points, n_releases, 5), and whitened
     place = np.interp(trial_data.time_s[:, None] - releases, times, np.arange(times.size))
     before, curves = np.minimum(place.astype(int), times.size - 2), np.column_stack([*sensitivities, plain])
     columns = curves[before] + (place - before)[..., None] * np.diff(curves, axis=0)[before]
     columns[..., -1] = (trial_data.lead_position_m - trial_effects[ORIGIN])[:, None] - columns[..., -1]
-    white = whiten(columns, trial_data.first, rho, trial_data.relative_sd).transpose(1, 2, 0)
-    square = white @ np.swapaxes(white, 1, 2) / variance
+    white = whiten(columns, trial_data.first, state.rho, trial_data.relative_sd).transpose(1, 2, 0)
+    square = white @ np.swapaxes(white, 1, 2) / float(state.variance[i])
     effects = np.tile(trial_effects, (releases.size, 1))
     effects[:, RELEASE] = releases
     information = square[:, :-1, :-1] + np.diag(precision)
@@ -225,12 +212,9 @@ def _best_release(
     largest = np.array([np.inf, 0.3, 0.3])  # Largest change of origin and deviations (chosen)
     step = np.clip(np.linalg.solve(information[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], -largest, largest)
     effects[:, ORIGIN:] += step
-    residual_squares = square[:, -1, -1] - np.sum(
-        step * (2 * gradient - (shared_information @ step[..., None])[..., 0]), axis=1
-    )
-    deviances = (
-        residual_squares + np.sum(precision * (effects - centre) ** 2, axis=1) + np.linalg.slogdet(information)[1]
-    )
+    explained = np.sum(step * (2 * gradient - (shared_information @ step[..., None])[..., 0]), axis=1)
+    penalty = np.sum(precision * (effects - centre) ** 2, axis=1)
+    deviances = square[:, -1, -1] - explained + penalty + np.linalg.slogdet(information)[1]
     k = int(np.argmin(deviances))
     return effects[k], float(deviances[-1] - deviances[k])
 
@@ -282,28 +266,20 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     """The constant part of a fit. Shapes: trial_effects (n_trials, 4)."""
     layout, data = predictor.layout, predictor.data
     lower, upper = layout.bounds
-    durations = np.array([trial_data.time_s[-1] - trial_data.time_s[0] for trial_data in data])
-    spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
-    frames = np.array([trial_data.frame_s for trial_data in data])
-    rests = np.array([trial_data.shows_rest for trial_data in data])
-    release_known = rests | np.array([trial_data.pressurised_in_recording for trial_data in data])
-    rest_sigma_m = np.array(
-        [0.0 if trial_data.imprecise_rest is None else trial_data.imprecise_rest.sigma_m for trial_data in data]
-    )
-    # 10.0, 10.0: prior standard deviations of release, frames, and of origin, in standard deviations of the noise
-    # (chosen)
-    release_sd = np.where(rests, 10.0 * frames, 3 * durations)
-    # 1e-6: prior standard deviation of the release of a vine that was pressurised during the recording: it is
-    # known (chosen)
-    release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = 1e-6
-    noise = np.array([trial_data.noise_m for trial_data in data])
-    origin_room_m = np.maximum(10.0 * np.maximum(noise, rest_sigma_m), 1e-4 * spans)
-    origin_sd = np.where(rests, origin_room_m, 3 * spans)
+    durations = np.array([each.time_s[-1] - each.time_s[0] for each in data])
+    frames, spans, rests = predictor.frames_s, predictor.spans_m, np.array([each.shows_rest for each in data])
+    pressurised = np.array([each.pressurised_in_recording for each in data])
+    noise_m = [max(each.noise_m, each.imprecise_rest.sigma_m if each.imprecise_rest else 0.0) for each in data]
+    # 10.0, 10.0: prior standard deviations of release, frames, and of origin, in standard deviations of the noise;
+    # 1e-6: that of the release of a vine that was pressurised during the recording: it is known (chosen)
+    release_sd = np.where(pressurised, 1e-6, np.where(rests, 10.0 * frames, 3 * durations))
+    origin_sd = np.where(rests, np.maximum(10.0 * np.array(noise_m), 1e-4 * spans), 3 * spans)
+    known = (rests | pressurised)[:, None]
     return MixedProblem(
         index=layout.index,
         has_deviation=np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation]),
-        gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
-        release_origin_mean=np.where(release_known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
+        gauge_error=np.array([each.gauge_error for each in data]),
+        release_origin_mean=np.where(known, initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         release_reach_s=frames,
         prior_mean=layout.start,
@@ -311,8 +287,8 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
         lower=lower,
         upper=upper,
         free=np.ones(lower.size, dtype=bool),
-        points=np.array([float(trial_data.time_s.size) for trial_data in data]),
-        stretches=np.array([float(np.count_nonzero(trial_data.first)) for trial_data in data]),
+        points=np.array([float(each.time_s.size) for each in data]),
+        stretches=np.array([float(np.count_nonzero(each.first)) for each in data]),
         random=layout.random,
     )
 
@@ -321,26 +297,16 @@ def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) 
     """Initial state: noise of the tracks alone, between-trial standard deviations as stated in the sheet or typical.
     Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
-    rho = track_correlation(data)
-    variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
-    relative = [
-        trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
-        for trial_data in data
-        if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
-    ]
+    variance = np.array([each.noise_m**2 * (1 - each.correlation**2) for each in data])
+    set_pressures = [each.trial for each in data if each.trial.pressure_Pa > 0]
+    relative = [one.pressure_sigma_Pa / one.pressure_Pa for one in set_pressures if np.isfinite(one.pressure_sigma_Pa)]
     spread = (float(np.mean(relative)) if relative else TYPICAL_SPREADS[0]), TYPICAL_SPREADS[1]
-    return FitState(theta, trial_effects, spread, rho, np.maximum(variance, variance_floor(data)))
+    return FitState(theta, trial_effects, spread, track_correlation(data), np.maximum(variance, variance_floor(data)))
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
-    """Lag-one correlation of the noise, estimated from the tracks without a model. Returns mean over trials, weighted
-    by points.
-    """
-    return float(
-        np.average(
-            [trial_data.correlation for trial_data in data], weights=[trial_data.time_s.size for trial_data in data]
-        )
-    )
+    """Lag-one correlation of the noise by the tracks alone: mean over trials, weighted by points."""
+    return float(np.average([each.correlation for each in data], weights=[each.time_s.size for each in data]))
 
 
 TYPICAL_SPREADS = (0.01, 0.03)  # Usual standard deviations of pressure (relative) and ln B between trials (chosen)
@@ -349,7 +315,7 @@ TYPICAL_SPREADS = (0.01, 0.03)  # Usual standard deviations of pressure (relativ
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
     """Least variance of the noise of each trial, given the accuracy of the integrator. Shape (n_trials,)."""
     # 2e-6: least noise, relative to a trial's travel, because the integrator is not more accurate (measured)
-    return np.array([(2e-6 * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
+    return np.array([(2e-6 * np.ptp(each.lead_position_m)) ** 2 for each in data])
 
 
 def estimable(problem: MixedProblem) -> tuple[bool, bool]:
@@ -372,14 +338,11 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone. Noise
     below the accuracy of the integrator is replaced by that accuracy, see `variance_floor`.
     """
-    data = predictor.data
-    rho = track_correlation(data)
-    noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), variance_floor(data))
+    data, problem, rho = predictor.data, solution.problem, track_correlation(predictor.data)
+    noise = np.maximum(np.array([each.noise_m**2 for each in data]) * (1 - rho**2), variance_floor(data))
     residual_squares = at_correlation(solution.cross_products, rho)[:, -1, -1]
-    fitted_degrees = (
-        np.count_nonzero(solution.problem.free) / residual_squares.size + 2 + solution.problem.has_deviation.any(axis=1)
-    )
-    return float(np.sum(residual_squares / noise) / np.sum(np.maximum(solution.problem.points - fitted_degrees, 1.0)))
+    fitted = np.count_nonzero(problem.free) / len(data) + 2 + problem.has_deviation.any(axis=1)
+    return float(np.sum(residual_squares / noise) / np.sum(np.maximum(problem.points - fitted, 1.0)))
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
@@ -394,11 +357,8 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 
 def relative_residuals(predictor: Predictor, solution: Solution) -> Floats:
     """Root mean square residual of each trial, relative to its observed growth, shape (n_trials,)."""
-    relative = [
-        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
-        for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
-    ]
-    return np.array(relative)
+    rms_m = [math.sqrt(float(np.mean(columns[:, -1] ** 2))) for columns in solution.columns]
+    return np.asarray(rms_m / np.maximum(predictor.spans_m, 1e-9))
 
 
 MOST_ITERATIONS = 60  # Maximum number of steps (chosen)
