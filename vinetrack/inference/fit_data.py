@@ -37,15 +37,7 @@ LENGTH_ERROR = 0.005  # Standard deviation of a vine's length, relative (chosen)
 
 
 class FitError(UserError, ValueError):
-    """The fit cannot be made; the message is one sentence with a remedy.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.fit(vt.base_model(), [])
-    Traceback (most recent call last):
-    vinetrack.inference.fit_data.FitError: No trial can be fitted: there is none.
-    """
+    """The fit cannot be made; the message is one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +82,7 @@ class FitTrial:
 
     @cached_property
     def window(self) -> tuple[Floats, Floats]:
-        """Times relative to each point over which it is averaged, s, and their weights; one entry if not smoothed."""
+        """Times relative to each point over which it is averaged, s, and their weights."""
         if self.smoothing is None:
             return np.zeros(1), np.ones(1)
         places = np.arange(self.smoothing.window) - self.smoothing.window // 2
@@ -151,7 +143,6 @@ def prepare_trial(
     rounding_m: float = 0.0,
 ) -> FitTrial:
     """The data of one trial: its usable points, rest included, and the noise that they show."""
-    fewest_moving = 4  # A trial with fewer points in motion is refused (derived)
     excluded, end = _near_end_of_growth(trial, track)
     usable = track.usable & ~excluded
     imprecise, imprecise_rest = _imprecise_points(track, usable)
@@ -171,14 +162,12 @@ def prepare_trial(
     if np.any(steps <= 0):
         raise FitError("its times do not increase: sort the rows or drop repeated ones")
     noise_m, correlation = position_noise(time_s, position_m)
-    noise_m = max(noise_m, rounding_m)
+    noise_m, pressures_Pa = max(noise_m, rounding_m), (trial.pressure_Pa, trial.yield_pressure_Pa)
     # The pressure must be able to move a bare vine within the errors of the sheet; gravity alone may move a payload.
     room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
     bare = track.pressure_Pa is None and trial.travel_ratio != 1 and trial.payload_kg == 0
     if bare and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa:
-        stated, least = (
-            pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in (trial.pressure_Pa, trial.yield_pressure_Pa)
-        )
+        stated, least = (pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in pressures_Pa)
         raise FitError(
             f"its pressure, {stated}, lies below the yield pressure, {least}, yet it moves: correct the sheet"
         )
@@ -190,17 +179,16 @@ def prepare_trial(
         backwards = "its position decreases while it grows: change the sign, or the points that it is made of"
         never = "its leading edge never moves forward beyond its noise"
         raise FitError(backwards if moved_m < -8.0 * noise_m else never)
-    n_rest = 0 if imprecise_rest is not None else rest_points(position_m)
+    n_rest = 0 if imprecise_rest is not None else _rest_before_motion(position_m)
     moving = time_s.size - n_rest
-    if 0 < moving < fewest_moving:
+    if moving < 4:  # (derived)
         raise FitError(
-            f"{moving} usable point{'s' * (moving != 1)} in motion, at least {fewest_moving} are needed: film faster,"
+            f"{moving} usable point{'s' * (moving != 1)} in motion, at least 4 are needed: film faster,"
             " or see in its overlay what hides the edge"
         )
     denoised = denoised or denoised_traces([track])[0]
     extended = None if denoised is None else denoised.extended().thinned()
-    stated_m = track.lead_position_sigma_m[usable]
-    filmed = trial.video is not None
+    stated_m, filmed, smooth_m = track.lead_position_sigma_m[usable], bool(trial.video), trial.position_systematic_m
     # 1.5: A point later than this many frames after the previous one begins a new stretch, whose noise is
     # independent of the previous one's (derived)
     return FitTrial(
@@ -208,21 +196,25 @@ def prepare_trial(
         time_s=time_s,
         lead_position_m=position_m,
         first=np.concatenate([[True], steps > 1.5 * np.median(steps)]),
-        n_rest=n_rest if n_rest < position_m.size else 0,
+        n_rest=n_rest,
         noise_m=noise_m,
         correlation=correlation,
         trace=None if extended is None else (extended.time_s, extended.pressure_Pa),
         gauge_error=0.0 if denoised is None else _gauge_error(denoised, time_s[max(n_rest - 1, 0) :]),
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
         imprecise_rest=imprecise_rest,
-        position_systematic_m=trial.position_systematic_m
-        if math.isfinite(trial.position_systematic_m)
-        else trial.systematic_of_travel * moved_m,
+        position_systematic_m=smooth_m if math.isfinite(smooth_m) else trial.systematic_of_travel * moved_m,
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
         sees_end=bool(usable[end].any()),
     )
+
+
+def _rest_before_motion(position_m: Floats) -> int:
+    """Number of points at rest before the motion; 0 where there is none, or no motion."""
+    n_rest = rest_points(position_m)
+    return n_rest if n_rest < position_m.size else 0
 
 
 def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
@@ -262,9 +254,9 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
     # provided that at least the second fraction of those in motion remains (chosen)
     imprecise = stated & (sigma_m > 3.0 * np.median(precise_half_m))
     usable_points = np.flatnonzero(usable)
-    at_rest = usable_points[: rest_points(track.lead_position_m[usable_points])]
+    at_rest = usable_points[: _rest_before_motion(track.lead_position_m[usable_points])]
     imprecise_rest = None
-    if 0 < at_rest.size < usable_points.size and (share_an_error or np.mean(imprecise[at_rest]) > 0.5):
+    if at_rest.size and (share_an_error or np.mean(imprecise[at_rest]) > 0.5):
         # The few remaining points of such a rest would determine the origin alone.
         imprecise[at_rest] = True
         imprecise_rest = ImpreciseRest(
@@ -288,9 +280,9 @@ def _quantised_points(
     places = np.flatnonzero(usable)
     y = track.lead_position_m[places]
     quantised = np.zeros(usable.size, dtype=bool)
-    n_rest = rest_points(y)
+    n_rest = _rest_before_motion(y)
     # 1.5: range of rounded positions at rest, in rounding steps, up to which rounding hides their noise (derived)
-    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > 1.5 * math.sqrt(12) * rounding_m:
+    if n_rest == 0 or np.ptp(y[:n_rest]) > 1.5 * math.sqrt(12) * rounding_m:
         return quantised, None
     quantised[places[:n_rest]] = True
     standstill_start = int(np.flatnonzero(y != y[-1])[-1]) + 1
@@ -308,9 +300,7 @@ def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], 
     if not np.isfinite(trial.length_m) or points.size < FEWEST_POINTS:
         return excluded, points[:0]
     y = track.lead_position_m[points]
-    noise_m = rough_noise(y) + 1e-9
-    n_rest = rest_points(y)
-    n_rest = n_rest if n_rest < y.size else 0
+    noise_m, n_rest = rough_noise(y) + 1e-9, _rest_before_motion(y)
     begin_m = float(np.mean(y[: max(n_rest, 1)]))
     # A track that stands still at its end, after a last step far above its noise, includes the end of growth.
     still = np.abs(y - np.median(y[-2:])) < 5 * noise_m
@@ -328,9 +318,7 @@ def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], 
 def pairs_of(
     experiment: Experiment | Path | str | Pairs, tracks: Mapping[str, Track] | None = None
 ) -> tuple[list[tuple[Trial, Track]], dict[str, str]]:
-    """Trials and their tracks, and the reason for each trial without one. Returns pairs, left_out (reason by name of
-    trial).
-    """
+    """Trials and their tracks, and the reason for each trial without one, by name."""
     from vinetrack.experiment.folder import Experiment, read_experiment
     from vinetrack.tracks.frame_timing import correct_frames
     from vinetrack.tracks.importers import load_track
@@ -391,24 +379,20 @@ def not_measured(pairs: Pairs) -> dict[str, str]:
         # 1.1: ratio of pressures that a gauge tells apart (chosen)
         if max(set_Pa) > 1.1 * min(set_Pa) or (is_noisy and min(set_Pa) > 1.1 * largest_Pa):
             for trial in trials:
-                end, stated = (
-                    pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in (largest_Pa, trial.pressure_Pa)
-                )
+                told_Pa = (largest_Pa, trial.pressure_Pa)
+                end, stated = (pressure_text(of_Pa, trial.pressure_unit, 6) for of_Pa in told_Pa)
                 said = f"its recorded pressure stands at {end} to the last digit, the sheet says {stated}"
                 reasons[trial.name] = f"{said}: the end of the gauge's range? Blank its trace"
     return reasons
 
 
 def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
-    """Data of the trials that can be fitted, and the reason for each that cannot, by name. Returns data, left_out
-    (reason by name of trial).
-    """
+    """Data of the trials that can be fitted, and the reason for each that cannot, by name."""
     data, left_out = [], {}
     pairs = list(pairs)
     # Estimated from all tracks: one with few points, or at constant speed, may not show it.
-    rounding_m = common_rounding_noise(
-        [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
-    )
+    imported = [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
+    rounding_m = common_rounding_noise(imported)
     smoothing = detect_smoothing(pairs, rounding_m)
     refused = not_measured(pairs)
     for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
@@ -429,9 +413,7 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
 
 
 def _with_errors_of_length(data: list[FitTrial]) -> list[FitTrial]:
-    """The trials with their ends weighted by the error of their vine's length, which its trials share: together they
-    are worth one measurement of it.
-    """
+    """The trials with their ends weighted by the error of their vine's length, which its trials share."""
     of_vine = Counter(each.trial.vine for each in data if each.sees_end)
     for i, each in enumerate(data):
         if each.sees_end:
@@ -447,12 +429,8 @@ def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
     package's tracker keep equal weights: it states the error of each and leaves out the worst.
     """
     imported = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
-    shape = noise_shape(
-        [data[i].time_s for i in imported],
-        [data[i].lead_position_m for i in imported],
-        [data[i].stated_m for i in imported],
-    )
-    if shape is None:
+    of_track = [[getattr(data[i], name) for i in imported] for name in ("time_s", "lead_position_m", "stated_m")]
+    if (shape := noise_shape(*of_track)) is None:
         return data
     # One correlation for all trials, as in a fit: a single track with unequal noise hardly determines it.
     correlation = np.average([data[i].correlation for i in imported], weights=[data[i].time_s.size for i in imported])

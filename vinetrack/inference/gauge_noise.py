@@ -521,9 +521,8 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
     noises = [noise_of_traces(read, rho) for rho in correlations]
     noisy = [k for k in range(len(read)) if min(of_all[k].sigma_Pa for of_all in noises) > 0]
     if noisy:
-        recorded = [
-            [Recorded(read[k], traces[k].time_s.size, of_all[k], growths[k]) for k in noisy] for of_all in noises
-        ]
+        counts = [trace.time_s.size for trace in traces]
+        recorded = [[Recorded(read[k], counts[k], of_all[k], growths[k]) for k in noisy] for of_all in noises]
         # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides, that
         # of traces which curves explain.
         clock = gauge_clock(recorded[0])
@@ -531,9 +530,7 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
         telling = np.flatnonzero((excess <= 1) | (excess.min() > 1)).tolist()
         possible = (Curves([of_all[k] for k in telling], clock) for of_all in recorded)
         curves = max(possible, key=lambda each: each.log_likelihood)
-        smooth = {
-            k: curve for k, curve, excess in zip(telling, curves.all(), curves.excess, strict=True) if excess <= 1
-        }
+        smooth = {k: one for k, one, excess in zip(telling, curves.all(), curves.excess, strict=True) if excess <= 1}
         for k, (place, trace) in enumerate(zip(noisy, recorded[0], strict=True)):
             quiet = smooth[k] if k in smooth else _splined(trace, clock)
             raw[places[place]] = DenoisedTrace(traces[place].time_s, *quiet)

@@ -69,7 +69,7 @@ class Jobs:
 
     @classmethod
     def concatenated(cls, parts: Sequence[Jobs]) -> Jobs:
-        """Concatenate several sets of jobs."""
+        """Several sets of jobs as one."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
@@ -105,18 +105,13 @@ class Motions:
 
     def averaged(self, averages: Sequence[Average]) -> Motions:
         """The motions at the requested points, their reported positions averaged over the times around them."""
-        out, stamps, times = [], [], []
-        for (first, last), average in zip(itertools.pairwise(self.batch.starts), averages, strict=True):
-            middle = average.place[:, average.weights.size // 2]
-            rows = self.out[first:last]
-            averaged = rows[middle]
-            averaged[:, OBSERVED] = rows[average.place, OBSERVED] @ average.weights
-            out.append(averaged)
-            stamps.append(self.batch.stamps[first:last][middle])
-            times.append(self.batch.arrays.times[first:last][middle])
-        arrays = self.batch.arrays._replace(times=np.concatenate(times), starts=starts_of(times))
-        batch = replace(self.batch, stamps=np.concatenate(stamps), arrays=arrays)
-        return replace(self, batch=batch, out=np.concatenate(out))
+        places = [first + each.place for first, each in zip(self.batch.starts, averages, strict=False)]
+        middles = [place[:, place.shape[1] // 2] for place in places]
+        kept, seen = np.concatenate(middles), zip(places, averages, strict=True)
+        out = self.out[kept]
+        out[:, OBSERVED] = np.concatenate([self.out[place, OBSERVED] @ each.weights for place, each in seen])
+        arrays = self.batch.arrays._replace(times=self.batch.arrays.times[kept], starts=starts_of(middles))
+        return replace(self, batch=replace(self.batch, stamps=self.batch.stamps[kept], arrays=arrays), out=out)
 
     def rows(self, first: int, last: int) -> Floats:
         """Rows of `out` of jobs `first` up to `last`, concatenated. Returns position, velocity and acceleration of the
@@ -157,49 +152,35 @@ class Predictor:
         self.layout, self.data, self.host = layout, data, host
         model = layout.model
         self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
-        driven = "pressure_drive" in model
-        self.has_pressure_deviation = np.array(
-            [
-                driven
-                and (trial_data.trial.pressure_Pa > 0 if trial_data.trace is None else trial_data.gauge_error > 0)
-                for trial_data in data
-            ],
-            dtype=bool,
-        )
-        self.has_damping_deviation = np.array(
-            [self.damping_column >= 0 and trial_data.trial.travel_ratio != 1 for trial_data in data], dtype=bool
-        )
-        check_needs(model, *(trial_data.trial for trial_data in data))
-        self.inputs = np.array([TrialInputs.of(trial_data.trial) for trial_data in data], dtype=float)
-        self.bends = [bends_of(trial_data.trial) for trial_data in data]
-        transformed = any(
-            {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model
-        )
-        smoothed = any(trial_data.smoothing is not None for trial_data in data)
-        self.averages = [Average.of(trial_data.time_s, *trial_data.window) for trial_data in data] if smoothed else []
-        transformed |= smoothed
-        self.release_is_shift = np.array([trial_data.trace is None and not transformed for trial_data in data])
-        self.ratios = [trial_data.trial.travel_ratio for trial_data in data]
-        self.times_s = [np.asarray(trial_data.time_s, dtype=float) for trial_data in data]
+        self.with_trace = np.array([each.trace is not None for each in data], dtype=bool)
+        self.ratios = [each.trial.travel_ratio for each in data]
+        uncertain = [each.trial.pressure_Pa > 0 if each.trace is None else each.gauge_error > 0 for each in data]
+        self.has_pressure_deviation = np.array(uncertain, dtype=bool) & ("pressure_drive" in model)
+        self.has_damping_deviation = (np.array(self.ratios) != 1) & (self.damping_column >= 0)
+        check_needs(model, *(each.trial for each in data))
+        self.inputs = np.array([TrialInputs.of(each.trial) for each in data], dtype=float)
+        self.bends = [bends_of(each.trial) for each in data]
+        seen_otherwise = {"true_time", "observed_position", "row_delay", "averaged_over"}
+        smoothed = any(each.smoothing is not None for each in data)
+        self.averages = [Average.of(each.time_s, *each.window) for each in data] if smoothed else []
+        transformed = smoothed or any(seen_otherwise & set(effect.functions) for effect in model)
+        self.release_is_shift = ~self.with_trace & (not transformed)
+        self.times_s = [np.asarray(each.time_s, dtype=float) for each in data]
         self.starts = starts_of(self.times_s)
-        self.lead_position_m = np.concatenate([trial_data.lead_position_m for trial_data in data])
-        self.spans_m = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
-        self.first = np.concatenate([trial_data.first for trial_data in data])
-        unequal_noise = any(trial_data.relative_sd is not None for trial_data in data)
-        self.relative_sd = np.concatenate([trial_data.point_sd for trial_data in data]) if unequal_noise else None
-        self.frames_s = np.array([trial_data.frame_s for trial_data in data])
-        self.with_trace = np.array([trial_data.trace is not None for trial_data in data], dtype=bool)
+        self.lead_position_m = np.concatenate([each.lead_position_m for each in data])
+        self.spans_m = np.array([np.ptp(each.lead_position_m) for each in data])
+        self.first = np.concatenate([each.first for each in data])
+        unequal_noise = any(each.relative_sd is not None for each in data)
+        self.relative_sd = np.concatenate([each.point_sd for each in data]) if unequal_noise else None
+        self.frames_s = np.array([each.frame_s for each in data])
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
         self.is_central = False  # whether differences are central, of twice as many simulations
 
     def with_steps_of(self, other: Predictor) -> Predictor:
         """The predictor with the finite differences to which another one of the same parameters has adapted."""
-        self.steps, self.pressure_step, self.is_central = (
-            other.steps.copy(),
-            other.pressure_step.copy(),
-            other.is_central,
-        )
+        self.steps, self.pressure_step = other.steps.copy(), other.pressure_step.copy()
+        self.is_central = other.is_central
         return self
 
     def run(self, jobs: Jobs, times_s: Sequence[Floats] | None = None, model: Model | None = None) -> list[Trajectory]:
@@ -295,10 +276,8 @@ class Predictor:
                 # The sensitivity to a difference between trials is that to the deviation, times the regressor.
                 column, source = self.layout.keys.index(term.key), PRESSURE if term.pressure else DAMPING_DEVIATION
                 trials = np.flatnonzero(self.layout.index[:, column] >= 0)
-                points, regressor = (
-                    self._points_of(trials),
-                    np.repeat(term.regressor[trials], np.diff(self.starts)[trials]),
-                )
+                points = self._points_of(trials)
+                regressor = np.repeat(term.regressor[trials], np.diff(self.starts)[trials])
                 table[points, N_TRIAL_EFFECTS + column] = term.scale * regressor * table[points, source]
         if not trial_effects_only:
             # Steps for the next call, by how far these moved the trajectories.
@@ -443,18 +422,16 @@ def middle_speed(trial_data: FitTrial) -> float:
 
 
 def align(predictor: Predictor, theta: Floats, trial_effects: Floats) -> tuple[Floats, Floats]:
-    """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
-    One trajectory per trial is simulated and shifted in time by interpolation. Returns trial_effects, misfit (ln of the
-    root mean square relative to the travel). Shapes: theta (n_free,); trial_effects (n_trials, 4) → (n_trials, 4).
+    """Best release and origin of each trial at given parameters, by a scan of one trajectory that is shifted in time.
+    Returns trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,);
+    trial_effects (n_trials, 4) → (n_trials, 4), (n_trials,).
     """
     data = predictor.data
     # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
     of_sheet = {"pressure_deviation": np.zeros(len(data)), "yield_pressure_Pa": np.full(len(data), math.nan)}
     jobs = replace(predictor.jobs(theta, trial_effects), **of_sheet)
-    durations = [
-        trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
-        for trial_data, begin in zip(data, jobs.release_s, strict=True)
-    ]
+    starts_s = np.minimum([each.time_s[0] for each in data], jobs.release_s)
+    durations = np.array([each.time_s[-1] for each in data]) - starts_s + 25 * predictor.frames_s
     grids = [np.linspace(0.0, duration, 240) for duration in durations]
     trajectories = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
     best, misfit = trial_effects.copy(), np.zeros(len(data))
