@@ -45,6 +45,7 @@ from vinetrack.inference.marginal_likelihood import (
     with_diagonal,
 )
 from vinetrack.inference.optimiser import (
+    CONVERGED_DECREASE,
     CONVERGED_VARIANCES,
     LARGEST_DEVIATION,
     Solution,
@@ -108,9 +109,8 @@ def student(dof: Floats) -> Floats:
 
 
 class WithSystematics(NamedTuple):
-    """A fit with its systematic errors included. `solution` holds the free parameters of the fit and after them the
-    sizes of the errors in prior standard deviations, and `sources` where each of these comes from. `gain` of ln L is
-    that over the fit as it is.
+    """A fit with its systematic errors as further parameters, in prior standard deviations, the source of each, and the
+    gain of ln L over the fit as it is.
     """
 
     solution: Solution
@@ -140,9 +140,8 @@ def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematic
 
 
 def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[Solution, float]:
-    """The solution after Newton steps at fixed sensitivities, and ln L there. Steps are taken as long as they raise
-    ln L. Two parameters that only rounding separates may get a step of any length along the direction in which they
-    cancel; no trajectory is simulated here that would reject it.
+    """The solution after Newton steps at fixed sensitivities, while they raise ln L, and ln L there: two parameters
+    that only rounding separates may get steps of any length along the direction in which they cancel.
     """
 
     def estimated_at(products: Floats, state: FitState) -> tuple[Solution, float]:
@@ -150,13 +149,11 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
         now = replace(solution, state=after, cross_products=products)
         return now, now.log_likelihood()
 
-    # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
-    # comparison, where differences count from 1; and the maximum number of steps (measured)
-    converged_decrease_smooth, most_steps, problem = 1e-2, 15, solution.problem
+    problem = solution.problem
     solution, level = estimated_at(predictor.products(solution.columns), solution.state)
     # The columns C and r of a trial become C and r − CΔ, and so do their products.
     total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(predictor.data), 1, 1))
-    for _ in range(most_steps):
+    for _ in range(15):  # (measured)
         state = solution.state
         step, own_step, predicted_decrease = levenberg_marquardt_step(solution.cross_products, problem, state, 0.0)
         change = np.zeros_like(total_change)
@@ -165,22 +162,17 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
         products = np.swapaxes(moved, 1, 2)[:, None] @ solution.cross_products @ moved[:, None]
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
         after, new_level = estimated_at(products, before)
-        if not new_level >= level - converged_decrease_smooth:  # nor is NaN taken
+        if not new_level >= level - CONVERGED_DECREASE:  # nor is NaN taken
             break
         solution, level, total_change = after, new_level, total_change + change
-        if (
-            predicted_decrease < converged_decrease_smooth
-            and variance_change(before, after.state) < CONVERGED_VARIANCES
-        ):
+        if predicted_decrease < CONVERGED_DECREASE and variance_change(before, after.state) < CONVERGED_VARIANCES:
             break
     columns = tuple(of_trial @ change for of_trial, change in zip(solution.columns, total_change, strict=True))
     return replace(solution, columns=columns), level
 
 
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:
-    """Information and scores of each trial on the free parameters, its trial effects integrated out. Returns
-    information, scores. Shape (n_trials, n_free, n_free).
-    """
+    """Information, (n_trials, n_free, n_free), and scores, (n_trials, n_free), of each trial on the free parameters."""
     problem = solution.problem
     size, state = problem.prior_mean.size, solution.state
     white = at_prior_means(whitened_products(solution.cross_products, state), problem, state, -1)
@@ -202,8 +194,7 @@ FEWEST_CLUSTERS = 8  # Clusters from which their scatter counts in tests of a mo
 
 def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats, Floats]:
     """Covariance of the free parameters by the noise model, (n_free, n_free); their variances from the scatter of
-    trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,); of systematic
-    errors those by the noise model. Parameters at a bound are fixed there.
+    trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,).
     """
     problem, theta = solution.problem, solution.state.theta
     information, scores = trial_information(solution)
@@ -223,9 +214,7 @@ def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, 
 
 
 def _covariance_by_noise(solution: Solution, information: Floats) -> Floats:
-    """Covariance of the unknowns by the noise model; those at a bound are fixed there. Shapes: information (n_trials,
-    n_free, n_free) → (n_free, n_free).
-    """
+    """Covariance of the unknowns by the noise model; those at a bound are fixed there."""
     problem, theta = solution.problem, solution.state.theta
     square = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (theta > problem.lower) & (theta < problem.upper)
@@ -236,7 +225,7 @@ def without(
     solution: Solution, information: Floats, scores: Floats, trials: Sequence[int]
 ) -> tuple[Floats, Floats] | None:
     """The step of the unknowns to the fit to all other trials, to first order, and a root of their covariance by those;
-    None where those do not determine what these depend on. `information` and `scores` are `trial_information`.
+    None where those do not determine what these depend on.
     """
     problem, theta, kept = solution.problem, solution.state.theta, np.delete(information, trials, axis=0)
     by_all, by_others = (np.einsum("nkk->k", each) + problem.prior_precision for each in (information, kept))
@@ -255,9 +244,7 @@ def scatter_variances(
 ) -> tuple[Floats, Floats]:
     """Variances of the first `count` unknowns from the disagreement of clusters, and their degrees of freedom. Each
     cluster pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in
-    units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i). Shapes:
-    information (n_clusters, n_free, n_free); scores (n_clusters, n_free); plain (n_free, n_free) →
-    (n_free,), (n_free,).
+    units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i).
     """
     variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
     estimated = np.flatnonzero(np.diag(plain) > 0)
@@ -349,7 +336,7 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
 
 
 def _summed_over(groups: Sequence[Hashable], single: Floats) -> Floats:
-    """Sums over the trials of each group. Shapes: single (n_trials, …) → (n_groups, …)."""
+    """Sums over the trials of each group."""
     of_trial = np.unique(np.asarray(groups), return_inverse=True)[1]
     sums = np.zeros((of_trial.max(initial=-1) + 1, *single.shape[1:]))
     np.add.at(sums, of_trial, single)
@@ -411,9 +398,7 @@ def film_influence(fit: Fit) -> Floats:
 
 
 def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...]:
-    """A message on the film mass where it matters as much as the stated errors, else none. Shapes: moved
-    (n_numbers,).
-    """
+    """A message on the film mass where it matters as much as the stated errors, else none."""
     sigma = np.array([number.sigma for number in numbers])
     ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
     affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= 1]
@@ -585,17 +570,10 @@ def _trial_fits(
 
 
 def trial_fit(
-    trial_data: FitTrial,
-    trial_effects: Floats,
-    position_m: Floats,
-    velocity_m_s: Floats,
-    rho: float,
-    variance: float,
+    trial_data: FitTrial, trial_effects: Floats, position_m: Floats, velocity_m_s: Floats, rho: float, variance: float,
     sigma: Floats | None = None,
-) -> TrialFit:
-    """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
-    velocity_m_s (n_points,).
-    """
+) -> TrialFit:  # fmt: skip
+    """One trial with its trial effects, their errors, and the predictions of the model."""
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m
     effects = [*trial_effects[:DAMPING_DEVIATION], math.expm1(trial_effects[DAMPING_DEVIATION])]

@@ -100,8 +100,7 @@ class FreeParameter:
 @dataclass(frozen=True)
 class ParameterMap:
     """The free parameters in order, and which of them apply to each trial. `index`, shape (n_trials, n_keys), gives the
-    place among `free` of each key for each trial, -1 where it does not apply. Every trial has as many columns as there
-    are keys, however many vines there are.
+    place among `free` of each key for each trial, -1 where it does not apply.
     """
 
     model: Model
@@ -128,12 +127,12 @@ class ParameterMap:
         return np.array([(number.scale / number.prior_sd) ** 2 for number in self.free])
 
     def values(self, theta: Floats) -> Floats:
-        """Values, SI, of scaled parameters. Shapes: theta (n_free,) → (n_free,)."""
+        """Values, SI, of scaled parameters."""
         return np.array([number.from_scaled(value) for number, value in zip(self.free, theta.tolist(), strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
-        """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (NaN where
-        the value in the sheet applies). Shapes: theta (n_free,) → (n_trials, n_parameters).
+        """Model parameters, (n_trials, n_parameters), and yield pressures of every trial, NaN where the value in the
+        sheet applies, for scaled parameters.
         """
         rows = self.base.copy()
         values = self.values(theta)
@@ -157,9 +156,7 @@ class ParameterMap:
         return np.array([number.key in keys for number in self.free], dtype=bool)
 
     def shifts(self, theta: Floats) -> Floats:
-        """Deviations of pressure (relative) and ln B by the systematic differences between trials. Shapes: theta
-        (n_free,) → (n_trials, 2).
-        """
+        """Deviations of pressure (relative) and ln B by the systematic differences, (n_trials, 2)."""
         shifts = np.zeros((self.index.shape[0], 2))
         values = np.append(self.values(theta), 0.0) if self.between else np.zeros(1)
         for term in self.between:
@@ -218,8 +215,8 @@ def make_layout(
 
 
 def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
-    """For each trial the name of the group with which it shares a parameter; blank if all trials share it. With `day`,
-    it is the vine unless the sheet states several days, and one for every trial: a camera is set up anew for either.
+    """For each trial the name of the group with which it shares a parameter, blank if all do: of `day` the vine unless
+    the sheet states several days, and one for every trial, since a camera is set up anew for either.
     """
     groups = [trial.group(shared) for trial in trials]
     if shared == "day" and (not all(groups) or len(set(groups)) == 1):
@@ -333,8 +330,8 @@ class Number(JsonRecord):
     def ends_at(self) -> str:
         """Ends of the 95 % interval that are bounds, not estimates: `lower`, `upper`, `lower and upper`, or blank."""
         slack = 1e-6 * max(abs(self.high - self.low), 1e-12 * max(abs(self.low), abs(self.high)))
-        ends = [("lower", self.low - self.lower <= slack), ("upper", self.upper - self.high <= slack)]
-        return " and ".join(name for name, is_bound in ends if is_bound)
+        ends = {"lower": self.low - self.lower, "upper": self.upper - self.high}
+        return " and ".join(name for name, room in ends.items() if room <= slack)
 
 
 @dataclass(frozen=True)

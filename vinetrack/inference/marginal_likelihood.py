@@ -226,15 +226,14 @@ def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, 
     n = problem.index.shape[0]
     centre, precision = np.zeros((n, problem.n_effects)), np.ones((n, problem.n_effects))
     centre[:, :2], precision[:, :2] = problem.release_origin_mean, problem.release_origin_precision
-    precision[:, DEVIATION_COLUMNS] = (
-        1 / np.maximum(trial_deviation_sd(problem, state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
-    )
+    least_sd = np.maximum(trial_deviation_sd(problem, state.spread), LEAST_BETWEEN_TRIAL_SD)
+    precision[:, DEVIATION_COLUMNS] = 1 / least_sd**2
     return centre, precision
 
 
 def trial_deviation_sd(problem: MixedProblem, spread: Floats | tuple[float, float]) -> Floats:
-    """Standard deviations of the deviations of pressure and ln B of each trial. Returns the gauge's error in place of
-    the first for a measured pressure. Shapes: spread (..., 2) → (..., n_trials, 2).
+    """Standard deviations of the deviations of pressure, of a measured one the gauge's error, and ln B of each trial.
+    Shapes: spread (..., 2) → (..., n_trials, 2).
     """
     sd = np.repeat(np.asarray(spread, dtype=float)[..., None, :], problem.gauge_error.size, axis=-2)
     sd[..., 0] = np.where(problem.gauge_error > 0, problem.gauge_error, sd[..., 0])
@@ -242,14 +241,14 @@ def trial_deviation_sd(problem: MixedProblem, spread: Floats | tuple[float, floa
 
 
 def shared_penalty(problem: MixedProblem, state: FitState) -> float:
-    """Contribution of the priors of the free parameters to the penalised sum of squares."""
+    """Part of the priors of the free parameters in the penalised sum of squares."""
     return float(np.sum(problem.prior_precision * (state.theta - problem.prior_mean) ** 2))
 
 
 def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats, Floats, float]:
-    """Normal equations of the free parameters: the blocks of keys and residual of all trials added up, and the priors.
-    Returns information, slope (half the negative gradient of the sum of squares), square (the penalised sum of
-    squares). Shapes: blocks (n_trials, n_keys + 1, n_keys + 1); theta (n_free,).
+    """Normal equations of the free parameters, the blocks of keys and residual of all trials added up, and the priors:
+    information, slope (half the negative gradient), and the penalised sum of squares. Shapes: blocks (n_trials, n_keys
+    + 1, n_keys + 1); theta (n_free,).
     """
     return added_up(blocks, problem.index, problem.prior_precision, theta - problem.prior_mean)
 
@@ -264,9 +263,7 @@ def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
 
 
 def inverse_of_block(square: Floats, places: NDArray[np.int_]) -> Floats:
-    """Pseudo-inverse of the block of a symmetric matrix at these places, 0 elsewhere. Shapes: square (n, n)
-    → (n, n).
-    """
+    """Pseudo-inverse of the block of a symmetric matrix, (n, n), at these places, 0 elsewhere."""
     scale = 1 / np.sqrt(np.diag(square)[places])
     scaled = square[np.ix_(places, places)] * scale[:, None] * scale
     inverse = np.zeros_like(square)
@@ -295,7 +292,7 @@ def eliminated(blocks: Floats, precision: Floats) -> tuple[Floats, Floats]:
 
 
 def with_diagonal(square: Floats, diagonal: Floats) -> Floats:
-    """Matrices with something added to their diagonals. Shapes: square (n, k, k); diagonal (n, k)."""
+    """Matrices, (n, k, k), with something added to their diagonals, (n, k)."""
     return np.asarray(square + diagonal[:, :, None] * np.eye(diagonal.shape[1]))
 
 
@@ -305,11 +302,11 @@ def whitened_products(cross_products: Floats, state: FitState) -> Floats:
 
 
 def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
-    """Cross products, changed in place: the residual is taken at zero deviations of pressure and ln B, and errors of
-    single trials, instead of the current ones, and the priors of release and origin add their pull, and their penalty
-    at the current values. Shapes: white (n_trials, k, k).
+    """Cross products, (n_trials, k, k), changed in place: the residual is taken at zero deviations of pressure and ln B
+    and errors of single trials, and the priors of release and origin add their pull, and their penalty at the current
+    values.
     """
-    columns = list(range(PRESSURE, state.trial_effects.shape[1]))
+    columns = np.s_[PRESSURE : state.trial_effects.shape[1]]
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
     white[:, :, residual] += explained
@@ -331,11 +328,9 @@ def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residu
 def levenberg_marquardt_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, damping: float
 ) -> tuple[Floats, Floats, float]:
-    """Damped Gauss–Newton step of parameters and trial effects, and the decrease that it predicts. The trial effects
-    are eliminated from the normal equations (Schur complement), the reduced system is solved within the bounds, and the
-    trial effects follow by back-substitution. Returns step, trial_effect_step, predicted_decrease (of the penalised sum
-    of squares along this step, by the linear model without the damping). Shapes: cross_products (n_trials, 3, k, k) →
-    (n_free,).
+    """Damped Gauss–Newton step of parameters, within the bounds, and of trial effects, which are eliminated before
+    (Schur complement) and follow by back-substitution; and the decrease of the penalised sum of squares along it by the
+    linear model. Shapes: cross_products (n_trials, 3, k, k) → (n_free,), (n_trials, n_effects).
     """
     precision = trial_effect_prior(problem, state)[1]
     white = _with_prior_gradient(cross_products, problem, state)
@@ -369,9 +364,8 @@ def trial_effect_step(cross_products: Floats, problem: MixedProblem, state: FitS
 
 def _held(precision: Floats, problem: MixedProblem) -> Floats:
     """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine filmed
-    at steady speed alone nothing tells the release: a full step, far beyond its start or end, would spoil that of all
-    trials, and steps of several frames would undo what `optimiser.likelier_releases` finds, time and again. Shapes:
-    precision (n_trials, n_effects).
+    at steady speed alone nothing tells the release: a full step would spoil that of all trials, and steps of several
+    frames would undo what `optimiser.likelier_releases` finds, time and again.
     """
     held = precision.copy()
     held[:, RELEASE] += 1 / problem.release_reach_s**2
@@ -379,9 +373,7 @@ def _held(precision: Floats, problem: MixedProblem) -> Floats:
 
 
 def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
-    """Whitened cross products; those of the trial effects with the residual include the pull of their priors, which
-    makes them half the negative gradient of the penalised sum of squares.
-    """
+    """Whitened cross products; those of effects and residual, half a negative gradient, with the pull of priors."""
     white = whitened_products(cross_products, state)
     centre, precision = trial_effect_prior(problem, state)
     white[:, : problem.n_effects, -1] -= precision * (state.trial_effects - centre)
@@ -391,26 +383,15 @@ def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: F
 
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
-
 # Least and largest noise correlation (chosen). Up to 0.97, 30 frames: what stays longer is misfit, and a random
 # walk would take up any. Slow errors of tracks are systematic ones.
 CORRELATIONS = (-0.5, 0.97)
 
 
-@dataclass(frozen=True)
-class Marginal:
-    """Whitened cross products of each trial with release, origin and its own errors eliminated. `blocks`, shape
-    (n_trials, 2 + n_keys + 1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual taken at zero
-    deviations.
-    """
-
-    blocks: Floats
-    log_constant: float
-
-
-def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> Marginal:
-    """Eliminate release, origin and errors of single trials, and take the residual at zero deviations. Shapes:
-    cross_products (n_trials, 3, k, k).
+def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> tuple[Floats, float]:
+    """Whitened cross products of [deviations, keys, residual] of each trial, release, origin and its own errors
+    eliminated, the residual taken at zero deviations; and the constant of −2 ln L. Shapes: cross_products (n_trials, 3,
+    k, k) → (n_trials, 2 + n_keys + 1, 2 + n_keys + 1).
     """
     white = at_prior_means(whitened_products(cross_products, state), problem, state, -1)
     precision = np.pad(problem.release_origin_precision, ((0, 0), (0, problem.own_errors)), constant_values=1.0)
@@ -418,17 +399,14 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
         own = np.r_[N_TRIAL_EFFECTS : problem.n_effects]
         order = np.r_[:PRESSURE, own, PRESSURE:N_TRIAL_EFFECTS, problem.n_effects : white.shape[-1]]
         white = white[:, order[:, None], order]
-    log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
-    log_alignment = np.sum(
-        np.linalg.slogdet(with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision))[1]
-        - np.log(precision).sum(axis=1)
-    )
-    constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
-    return Marginal(eliminated(white, precision)[0], constant)
+    constant = np.sum(problem.points * np.log(2 * math.pi * state.variance))
+    constant -= np.sum(problem.stretches) * math.log(1 - state.rho**2) + np.sum(np.log(precision))
+    square = with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision)
+    return eliminated(white, precision)[0], float(constant + np.sum(np.linalg.slogdet(square)[1]))
 
 
 def deviances(
-    part: Marginal, problem: MixedProblem, state: FitState, spreads: Floats, *, restricted: bool = True
+    part: tuple[Floats, float], problem: MixedProblem, state: FitState, spreads: Floats, *, restricted: bool = True
 ) -> Floats:
     """−2 ln of the (restricted) likelihood at each of several between-trial standard deviations, profiled over the
     parameters. Shapes: spreads (n, 2) → (n,).
@@ -436,19 +414,23 @@ def deviances(
     sd = trial_deviation_sd(problem, spreads) * problem.has_deviation
     prior, theta = problem.prior_precision, state.theta
     room = theta - problem.lower, problem.upper - theta, problem.free, problem.random
-    found = profiled(part.blocks, sd, problem.index, prior, theta - problem.prior_mean, *room, restricted)
-    return np.asarray(found + part.log_constant)
+    found = profiled(part[0], sd, problem.index, prior, theta - problem.prior_mean, *room, restricted)
+    return np.asarray(found + part[1])
 
 
 def estimate_between_trial_sd(
-    part: Marginal, problem: MixedProblem, state: FitState, estimable: tuple[bool, bool], *, restricted: bool = True
+    part: tuple[Floats, float],
+    problem: MixedProblem,
+    state: FitState,
+    estimable: tuple[bool, bool],
+    *,
+    restricted: bool = True,
 ) -> tuple[float, float]:
-    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search. The
-    likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from the
-    best of a grid and the current values; these stay where others are hardly likelier, since along the valley between
-    pressure and B the maximum moves far with every step of a fit. The restricted likelihood is multiplied by each
-    standard deviation, so that none ends at 0, where its own error would count for nothing (Chung et al., Psychometrika
-    78, 685, 2013: about one standard error from 0 then).
+    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search from
+    the best of a grid and the current values: there may be two maxima, since pressure and B can explain the same
+    variation. The current ones stay where others are hardly likelier: along the valley between pressure and B the
+    maximum moves far with every step of a fit. The restricted likelihood is multiplied by each standard deviation, so
+    that none ends at 0 (Chung et al., Psychometrika 78, 685, 2013: about one standard error from 0 then).
     """
     if not any(estimable):
         return state.spread
@@ -493,10 +475,8 @@ def matrix_root(square: Floats) -> Floats:
 def estimate_noise(
     cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None
 ) -> tuple[float, Floats]:
-    """Noise correlation, the same for all trials, and innovation variance of each trial, by restricted likelihood. The
-    residuals are those after the trial effects have been fitted. Each variance is shrunk towards the common one by as
-    much as the differences between trials are due to chance. Returns rho, variance. Shapes: cross_products (n_trials,
-    3, k, k) → (n_trials,).
+    """Noise correlation of all trials and innovation variance of each, by restricted likelihood of the residuals after
+    the trial effects have been fitted.
     """
     centre, precision = trial_effect_prior(problem, state)
     prior_precision, m = precision * state.variance[:, None], problem.n_effects

@@ -106,9 +106,8 @@ LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
 
 
 def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
-    """One Gauss–Newton step of the trial effects at fixed parameters, and the resulting cost of each trial. The trial
-    effects are determined so precisely that a step of the shared parameters leaves the curved valley; this step returns
-    to it. Returns state, costs. Shape (n_trials,).
+    """One Gauss–Newton step of the trial effects at fixed parameters, and the resulting cost of each trial: effects are
+    so precise that a step of the shared parameters leaves the curved valley, to which this step returns.
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     step = trial_effect_step(predictor.products(columns), problem, state)
@@ -130,9 +129,7 @@ def moved_effects(trial_effects: Floats, step: Floats) -> Floats:
 def trial_costs(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None
 ) -> Floats:
-    """Penalised sum of squares of each trial: its whitened residuals plus the priors of its effects. Shapes: residuals
-    (n_points_of_all,) → (n_trials,).
-    """
+    """Penalised sum of squares of each trial, (n_trials,): its whitened residuals plus the priors of its effects."""
     if residuals is None:
         residuals = predictor.residuals(state.theta, state.trial_effects)
     white = whiten(residuals, predictor.first, state.rho, predictor.relative_sd)
@@ -142,9 +139,7 @@ def trial_costs(
 
 
 def residuals_in(columns: Sequence[Floats]) -> Floats:
-    """The residuals among the columns of a linearisation, of all trials. Shapes: columns (n_points, k) →
-    (n_points_of_all,).
-    """
+    """The residuals among the columns of a linearisation, of all trials, (n_points_of_all,)."""
     return np.concatenate([column[:, -1] for column in columns])
 
 
@@ -152,9 +147,8 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 
 def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
-    """The state with releases at which the trials' likelihoods, their effects integrated out, are higher; None if there
-    are none. They are proposed by the linear model, and kept where they remain better after a few steps on simulated
-    trajectories. Of trials pressurised during the recording the trace shows the release.
+    """The state with releases at which the trials' likelihoods are higher; None if there are none. They are proposed by
+    the linear model, and kept where they remain better after a few steps on simulated trajectories.
     """
     places = [i for i, trial_data in enumerate(predictor.data) if not trial_data.pressurised_in_recording]
     if not places:
@@ -294,9 +288,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
 
 
 def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) -> FitState:
-    """Initial state: noise of the tracks alone, between-trial standard deviations as stated in the sheet or typical.
-    Shapes: theta (n_free,); trial_effects (n_trials, 4).
-    """
+    """Initial state: noise of the tracks alone, between-trial standard deviations as stated in the sheet or typical."""
     variance = np.array([each.noise_m**2 * (1 - each.correlation**2) for each in data])
     set_pressures = [each.trial for each in data if each.trial.pressure_Pa > 0]
     relative = [one.pressure_sigma_Pa / one.pressure_Pa for one in set_pressures if np.isfinite(one.pressure_sigma_Pa)]
@@ -328,16 +320,14 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
 
 
 # ------------------------------------------------------------------------------
-# How well a solution describes the tracks: χ² per degree of freedom, relative residual, and what counts as poor.
+# How well a solution describes the tracks, and the iterations.
 
 # χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried (chosen)
 POOR_FIT = 4.0
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone. Noise
-    below the accuracy of the integrator is replaced by that accuracy, see `variance_floor`.
-    """
+    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone."""
     data, problem, rho = predictor.data, solution.problem, track_correlation(predictor.data)
     noise = np.maximum(np.array([each.noise_m**2 for each in data]) * (1 - rho**2), variance_floor(data))
     residual_squares = at_correlation(solution.cross_products, rho)[:, -1, -1]
@@ -346,9 +336,8 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
-    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth. Both
-    are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths. That
-    is far above its noise, but no reason to try other starts.
+    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth: slow
+    errors of a few tenths of a millimetre may be far above the noise of a tracker, but are no reason to start anew.
     """
     # 3e-3: residual of the median trial, relative to its growth, above which a fit is poor (chosen)
     missed = float(np.median(relative_residuals(predictor, solution)))
@@ -371,8 +360,8 @@ CONVERGED_VARIANCES = 0.02
 
 @dataclass(frozen=True)
 class FixedTerms:
-    """Variance components that are fixed instead of estimated. `spread` are the between-trial standard deviations of
-    pressure (relative) and of ln B; `noise` is the correlation and the innovation variance of each trial, m².
+    """Variance components that are not estimated: between-trial standard deviations of pressure (relative) and of ln B;
+    correlation of the noise and its innovation variance in each trial, m².
     """
 
     spread: tuple[float, float] | None = None
@@ -401,9 +390,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts.
-    Systematic errors are fitted after the last step and change the reported values slightly.
-    """
+    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts."""
 
     iteration: int
     values: Mapping[str, float]
@@ -424,10 +411,7 @@ def solve(
     least_decrease: float = CONVERGED_DECREASE,
     least: float = -math.inf,
 ) -> Solution:
-    """Iterate the mixed-effects fit to convergence, or until ln L will clearly not reach `least`. Method:
-    Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton steps for the parameters alternate with estimates of
-    noise and between-trial standard deviations; Levenberg–Marquardt damping where a full step fails.
-    """
+    """Iterate the mixed-effects fit to convergence, or until ln L will clearly not reach `least`."""
     fixed_terms, estimable_sd = fixed_terms or FixedTerms(), estimable(problem)
     if fixed_terms.spread is not None:
         state, estimable_sd = replace(state, spread=fixed_terms.spread), (False, False)
@@ -475,9 +459,8 @@ def solve(
             break
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
-        accepted, damping = _accepted_step(
-            predictor, problem, cross_products, state, damped[:2], damping, penalised_squares
-        )
+        at = (predictor, problem, cross_products, state)
+        accepted, damping = _accepted_step(*at, damped[:2], damping, penalised_squares)
         try:
             if accepted is not None:
                 columns, cross_products = _linearise(predictor, accepted)
@@ -496,14 +479,9 @@ def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Flo
 
 
 def update_variances(
-    predictor: Predictor,
-    problem: MixedProblem,
-    cross_products: Floats,
-    state: FitState,
-    estimable_sd: tuple[bool, bool],
-    noise_held: bool,
-    far_off: bool = False,
-) -> FitState:
+    predictor: Predictor, problem: MixedProblem, cross_products: Floats, state: FitState,
+    estimable_sd: tuple[bool, bool], noise_held: bool, far_off: bool = False,
+) -> FitState:  # fmt: skip
     """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
     if not noise_held:
         rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
@@ -515,26 +493,19 @@ def update_variances(
 
 
 def variance_change(before: FitState, after: FitState) -> float:
-    """Largest relative change of noise and between-trial standard deviations. Between-trial standard deviations well
-    below 0.001 count as zero.
-    """
+    """Largest relative change of noise and between-trial standard deviations; those well below 0.001 count as zero."""
     spreads = [abs(np.log((b + 1e-3) / (a + 1e-3))) for a, b in zip(before.spread, after.spread, strict=True)]
     noise = np.max(np.abs(np.log(after.variance / before.variance)))
     return float(max(*spreads, noise, abs(after.rho - before.rho)))
 
 
 def _accepted_step(
-    predictor: Predictor,
-    problem: MixedProblem,
-    cross_products: Floats,
-    state: FitState,
-    steps: tuple[Floats, Floats],
-    damping: float,
-    penalised_squares: float,
-) -> tuple[FitState | None, float]:
+    predictor: Predictor, problem: MixedProblem, cross_products: Floats, state: FitState,
+    steps: tuple[Floats, Floats], damping: float, penalised_squares: float,
+) -> tuple[FitState | None, float]:  # fmt: skip
     """The first state that lowers the penalised sum of squares, and the damping for the next step. A line search comes
     first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
-    turn it across the valley. `penalised_squares` is that of the current state.
+    turn it across the valley.
     """
 
     def lowered(step: Floats, effect_step: Floats) -> FitState | None:
@@ -561,9 +532,7 @@ def _accepted_step(
 
 
 def cost(predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None) -> float:
-    """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects.
-    Shapes: residuals (n_points_of_all,).
-    """
+    """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects."""
     return float(np.sum(trial_costs(predictor, problem, state, residuals))) + shared_penalty(problem, state)
 
 
@@ -577,9 +546,7 @@ STEPS_TO_TELL = 4  # Steps by which it shows whether a fit stays poor (chosen)
 def solve_from(
     predictor: Predictor, theta: Floats, fixed_terms: FixedTerms, *, least: float = -math.inf, **how: Any
 ) -> Solution:
-    """Solve from given parameters and the releases that suit them, with the initial noise and standard deviations of
-    `first_state`; `least` and `how` are options of `_solve_or_alike`. Shapes: theta (n_free,).
-    """
+    """Solve from parameters and the releases that suit them; `least` and `how` are options of `_solve_or_alike`."""
     trial_effects, _ = align(predictor, theta, initial_trial_effects(predictor.data))
     problem, state = make_problem(predictor, trial_effects), first_state(predictor.data, theta, trial_effects)
     if (rows := _part(predictor)).size:
@@ -590,7 +557,7 @@ def solve_from(
 
 
 def _part(predictor: Predictor) -> NDArray[np.int_]:
-    """Rows of the trials with which a fit of many begins, evenly spaced by vine; none where there are few."""
+    """The trials with which a fit of many begins, evenly spaced by vine; none where there are few."""
     # 24, 2: trials with which a fit of at least twice as many begins, or this many per parameter (chosen)
     count, vines = max(24, 2 * len(predictor.layout.free)), [one.trial.vine for one in predictor.data]
     if len(vines) < 2 * count:
@@ -649,8 +616,7 @@ def solve_onward(
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
     are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, and with
-    trials that are alike: noise and differences between trials would take up what the model can explain. Shapes: theta
-    (n_free,).
+    trials that are alike: noise and differences between trials would take up what the model can explain.
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean

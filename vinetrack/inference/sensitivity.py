@@ -114,8 +114,8 @@ class Motions:
         return replace(self, batch=replace(self.batch, stamps=self.batch.stamps[kept], arrays=arrays), out=out)
 
     def rows(self, first: int, last: int) -> Floats:
-        """Rows of `out` of jobs `first` up to `last`, concatenated. Returns position, velocity and acceleration of the
-        tail, position of the edge as the camera reports it. Shape (n_times, 4).
+        """Position, velocity and acceleration of the tail, and position of the edge as the camera reports it, of jobs
+        `first` up to `last`, concatenated, (n_times, 4).
         """
         return self.out[self.batch.starts[first] : self.batch.starts[last]]
 
@@ -220,9 +220,7 @@ class Predictor:
         ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> Jobs:
-        """Simulation jobs at given parameters and trial effects. Shapes: theta (n_free,); trial_effects
-        (n_trials, 4).
-        """
+        """Simulation jobs at given parameters, (n_free,), and trial effects, (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
         deviations = trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] + self.layout.shifts(theta)
         if self.damping_column >= 0:
@@ -230,13 +228,11 @@ class Predictor:
         return Jobs(np.arange(len(self.data)), rows, yields, deviations[:, 0], trial_effects[:, RELEASE])
 
     def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
-        """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
+        """Trajectories at given parameters and trial effects."""
         return self.run(self.jobs(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> Floats:
-        """Measured minus predicted positions of all trials. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
-        (n_points_of_all,).
-        """
+        """Measured minus predicted positions of all trials, (n_points_of_all,)."""
         motions = self._simulated(self.jobs(theta, trial_effects))
         return self._residuals(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects)
 
@@ -245,9 +241,9 @@ class Predictor:
         return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
 
     def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
-        """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
-        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1). One-sided differences hold second
-        derivatives, which promise steps that no trajectory keeps: they are for trial effects alone, and far from a fit.
+        """Sensitivities [trial effects, keys of the layout] and residual of every trial, (n_points, 4 + n_keys + 1).
+        One-sided differences hold second derivatives, which promise steps that no trajectory keeps: they are for trial
+        effects alone, and far from a fit.
         """
         unperturbed, central = self.jobs(theta, trial_effects), self.is_central and not trial_effects_only
         sides, at = ((1, -1) if central else (1,)), (unperturbed, theta, trial_effects, trial_effects_only)
@@ -304,18 +300,14 @@ class Predictor:
         change[over] = np.repeat(at_end, counts)[over]
 
     def products(self, columns: Sequence[Floats]) -> Floats:
-        """Cross products of the columns of every trial under its noise, see `gaussian_processes`. Shapes: columns
-        (n_points, k) → (n_trials, 3, k, k).
-        """
+        """Cross products of the columns of every trial under its noise, (n_trials, 3, k, k)."""
         of_trials = zip(columns, self.data, strict=True)
         return np.stack([products(values, trial.first, trial.relative_sd) for values, trial in of_trials])
 
     def _perturbations(
         self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool, side: int
     ) -> Iterator[tuple[int, Floats, Jobs]]:
-        """For each column to be differenced: its place, the step of each trial to this side (within the bounds), and
-        the perturbed jobs.
-        """
+        """Place of each column to be differenced, step of each trial (within the bounds), and perturbed jobs."""
         damping_step = 1e-3 * side  # Relative step of B (derived)
         if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
             # 0.1: step of the release, frames (chosen)
@@ -367,9 +359,7 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
 
 
 def best_start(predictor: Predictor) -> Floats:
-    """Starting values of the scaled parameters of least misfit, of all combinations of further starting values. The
-    release of each trial is scanned at the same time.
-    """
+    """Scaled parameters of least misfit, of all combinations of further starting values, each release scanned."""
     layout, scored = predictor.layout, list[tuple[float, int, Floats]]()
     trial_effects, failure = initial_trial_effects(predictor.data), None
     start_values = [sorted({number.start, *number.further_starts}) for number in layout.free]
@@ -387,9 +377,7 @@ def best_start(predictor: Predictor) -> Floats:
 
 
 def _with_best_damping(predictor: Predictor, theta: Floats, trial_effects: Floats) -> Floats:
-    """Starting values with the B of every vine that has the least misfit of its trials, of a few that balance part of
-    the drive at the observed speed.
-    """
+    """Starting values with the B of least misfit for every vine, of a few that balance part of the drive."""
     layout, data = predictor.layout, predictor.data
     exponents = layout.rows(theta)[0][:, layout.model.parameter_names.index(EXPONENT)]
     # Forces on the tips above the yield forces, N, from the recorded pressures where there are any

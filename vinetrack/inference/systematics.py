@@ -26,7 +26,6 @@ PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to 
 
 FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
 
-
 # Sources of systematic errors in every fit: all but the film, which can be weighed
 SOURCES = ("payloads", "set pressures", "gauge", "tracking", "lens")
 
@@ -36,11 +35,10 @@ HALF_WAVES = 6
 
 @dataclass(frozen=True)
 class Systematics:
-    """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
-    payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
-    columns only for those that affect it. `places`, shape (n_trials, n_columns), gives the error of each column, -1 for
-    none, and `sources`, shape (count,), where each error comes from. Those of one trial alone, `own`, are unknowns of
-    that trial like its effects, and are eliminated with them: a campaign has many of them.
+    """Displacement of the positions of each trial by one standard deviation of each systematic error that affects it.
+    `places`, shape (n_trials, n_columns), gives the error of each column, -1 for none, and `sources`, shape (count,),
+    where each error comes from. Those of one trial alone, `own`, are unknowns of that trial like its effects, and are
+    eliminated with them: a campaign has many of them.
     """
 
     columns: list[Floats]
@@ -65,10 +63,9 @@ class Systematics:
 
     def among(self, problem: MixedProblem) -> MixedProblem:
         """The problem of a fit with the errors as further unknowns, each with a standard normal prior."""
-        places = np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)
-        extended = with_unknowns(problem, self.count)
+        index = np.column_stack([problem.index, np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)])
         own = problem.own_errors + self.own[0].shape[1]
-        return replace(extended, index=np.column_stack([problem.index, places]), own_errors=own)
+        return replace(with_unknowns(problem, self.count), index=index, own_errors=own)
 
 
 # By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
@@ -82,7 +79,7 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
         "set pressures": _set_pressure_errors,
         "film": _film_errors,
         "tracking": _tracker_errors,
-        "lens": _lens_errors,
+        "lens": lambda *fit: {i: ("", shapes) for i, shapes in enumerate(position_shapes(fit[0], grown_in(*fit)))},
     }
     data = predictor.data
     columns: list[list[Floats]] = [[np.zeros((each.time_s.size, 0))] for each in data]
@@ -125,11 +122,11 @@ def _changes_of(
 def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
     carried = [each.trial.payload_kg > 0 and each.trial.travel_ratio != 1 for each in predictor.data]
-    step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
-    # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
+    # 1e-2, 0.5: relative step of a payload's mass for its derivative (derived), and standard deviation of the mass in
+    # addition to that of the sheet, in such steps
     return {
-        i: (round(predictor.data[i].trial.payload_kg, 9), 0.005 / step * change_m)
-        for i, change_m in _changes_by(predictor, solution, "payload_kg", step, carried)
+        i: (round(predictor.data[i].trial.payload_kg, 9), 0.5 * change_m)
+        for i, change_m in _changes_by(predictor, solution, "payload_kg", 1e-2, carried)
     }
 
 
@@ -176,13 +173,8 @@ def _gauge_errors(predictor: Predictor, solution: Solution) -> list[Floats]:
     of_trial = [[np.zeros((each.time_s.size, 0))] for each in predictor.data]
     for i, change_m in _changes_of(predictor, solution, misread):
         of_trial[i].append(change_m)
-    width = max(map(len, of_trial)) - 1
-    return [np.pad(np.hstack(moved_m), ((0, 0), (0, width + 1 - len(moved_m)))) for moved_m in of_trial]
-
-
-def _lens_errors(predictor: Predictor, solution: Solution) -> Displaced:
-    """Smooth errors of position that all trials of a camera share."""
-    return {i: ("", shapes) for i, shapes in enumerate(position_shapes(predictor, grown_in(predictor, solution)))}
+    width = max(map(len, of_trial))
+    return [np.pad(np.hstack(moved_m), ((0, 0), (0, width - len(moved_m)))) for moved_m in of_trial]
 
 
 def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
@@ -200,17 +192,18 @@ def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
 def _slow_shapes(part: Floats, slow_m: Floats) -> Floats:
     """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 5), m. Waves along the growth
     have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
-    the very start and one after it; two more grow towards the end. The tip at rest lies before background that no frame
-    shows, the same for all recordings of a camera that stands still.
+    the very start and one after it; one is of the tip at rest, before background that no frame shows; two grow towards
+    the end.
     """
-    end_shapes = ((0.1, 2.0), (0.03, 4.0))  # Fractions of the growth before its end (measured)
     usual = np.minimum(slow_m, np.median(slow_m))
     excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
     # 0.015, 0.002: fractions of the growth over which a slow error that is larger at the start, and the error at rest,
     # may decay: a door, and the blur of the edge (chosen)
     start, rest = (np.exp(-np.maximum(part, 0.0) / fraction) for fraction in (0.015, 0.002))
-    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in end_shapes]
+    # 0.1, 0.03: fractions of the growth before its end (measured)
+    before_end = part - np.max(part)
+    ends = [2.0 * usual * np.exp(before_end / 0.1), 4.0 * usual * np.exp(before_end / 0.03)]
     return np.column_stack([waves, excess * start, excess * (1 - start), slow_m * rest, *ends])
 
 
@@ -218,30 +211,26 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
     trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
     """
-    orders = (1, 2, 3, 4)  # Legendre orders of the shapes
-    sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
-    if not (sigma_m > 0).any():
+    orders = np.arange(1, 5)  # Legendre orders of the shapes
+    sigma_m = [trial_data.position_systematic_m for trial_data in predictor.data]
+    if not max(sigma_m) > 0:
         return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
     # Without any growth the shapes are zero, since their value at rest is subtracted.
     # 1e-9: growth that counts as none (derived)
     reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
-    select = np.eye(max(orders) + 1)[list(orders)].T
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
-    at_rest = (-1.0) ** np.array(orders)
     return [
-        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
-        for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
+        sigma * (np.polynomial.legendre.legvander(2 * np.clip(growth_m / reach, 0, 1) - 1, 4)[:, 1:] - (-1.0) ** orders)
+        for growth_m, sigma in zip(grown_m, sigma_m, strict=True)
     ]
 
 
 def with_unknowns(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
     """The problem with further free parameters, each with a normal prior of mean 0 and on all trials."""
     places = problem.prior_mean.size + np.arange(count)
-    # A column that belongs to no free parameter has index −1, the appended zero.
-    index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
     return replace(
         problem,
-        index=index,
+        index=np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))]),
         prior_mean=np.append(problem.prior_mean, np.zeros(count)),
         prior_precision=np.append(problem.prior_precision, np.full(count, prior_precision)),
         lower=np.append(problem.lower, np.full(count, -np.inf)),
@@ -253,9 +242,5 @@ def with_unknowns(problem: MixedProblem, count: int, prior_precision: float | Fl
 
 def grown_in(predictor: Predictor, solution: Solution) -> list[Floats]:
     """Growth of each trial by a fit, m, shape (n_points,)."""
-    return [
-        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
-        for trial_data, trial_effects, columns in zip(
-            predictor.data, solution.state.trial_effects, solution.columns, strict=True
-        )
-    ]
+    of_trials = zip(predictor.data, solution.state.trial_effects[:, ORIGIN], solution.columns, strict=True)
+    return [trial_data.lead_position_m - origin_m - columns[:, -1] for trial_data, origin_m, columns in of_trials]
