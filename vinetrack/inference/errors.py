@@ -85,19 +85,11 @@ def precision(solution: Solution) -> Precision:
     information = trial_information(solution)[0].sum(axis=0) + np.diag(problem.prior_precision)
     diagonal = np.diag(information)
     insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
-    k = np.flatnonzero(problem.free & ~insensitive)
-    covariance = np.zeros_like(information)
-    collinear = np.zeros(diagonal.size, dtype=bool)
-    if k.size:
-        scale = 1 / np.sqrt(diagonal[k])
-        values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
-        # 1e-10: smallest eigenvalue of an information matrix of unit diagonal at which a direction still
-        # counts as determined
-        singular = values < 1e-10
-        for column in np.flatnonzero(singular):
-            collinear[k] |= np.abs(vectors[:, column]) > 0.1
-        inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
-        covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
+    k, collinear = np.flatnonzero(problem.free & ~insensitive), np.zeros(diagonal.size, dtype=bool)
+    scale, covariance = 1 / np.sqrt(diagonal[k]), inverse_of_block(information, k)
+    values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
+    # 1e-10: smallest eigenvalue of an information matrix of unit diagonal at which a direction counts as determined
+    collinear[k] = (np.abs(vectors[:, values < 1e-10]) > 0.1).any(axis=1)
     unknown = np.flatnonzero(insensitive | collinear)
     covariance[unknown, unknown] = math.inf
     return Precision(covariance, insensitive, collinear)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -78,23 +79,6 @@ from vinetrack.inference.systematics import PRESSURE_ERROR_PA, position_shapes
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
 
-def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
-    """Predicted trials with the half width of their 95 % bands, None where a trial depends on a parameter that the fit
-    does not determine. Shape (n_points,).
-    """
-    discrepancy, reach = _calibrated(fit)
-    banded = []
-    for trial_data, trial in zip(data, predicted, strict=True):
-        try:
-            variance = _variance_of_new_trial(fit, trial_data, trial)
-        except (SimulationError, FitError):
-            banded.append(trial)
-            continue
-        variance += (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
-        banded.append(replace(trial, band_m=reach * np.sqrt(variance)))
-    return banded
-
-
 def _calibrated(fit: Fit) -> tuple[float, float]:
     """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel, and
     the half width of the band in standard deviations.
@@ -112,15 +96,13 @@ def _calibrated(fit: Fit) -> tuple[float, float]:
     # Restricted likelihood loses a degree of freedom for each fitted parameter; δ loses one.
     fitted = 1 if delta2 > 0 else int(np.count_nonzero(solution.problem.prior_precision == 0))
     degrees = math.inf if assumed else max(float(len(predictable) - fitted), 1.0)
-    reaches = np.sort(
-        [
-            np.quantile(np.abs(residual) / np.sqrt(variance + delta2 * scale), COVERED_POSITIONS)
-            for (_, residual, variance), scale in zip(predictable, travel2, strict=True)
-        ]
-    )
+    missed = [
+        np.abs(residual) / np.sqrt(variance + delta2 * scale)
+        for (_, residual, variance), scale in zip(predictable, travel2, strict=True)
+    ]
+    reaches = sorted(float(np.quantile(each, COVERED_POSITIONS)) for each in missed)
     enough = min(math.ceil(COVERAGE * (len(predictable) + 1)), len(predictable))
-    reach = max(float(student(np.array([degrees]))[0]), float(reaches[enough - 1]))
-    return math.sqrt(delta2), reach
+    return math.sqrt(delta2), max(float(student(np.array([degrees]))[0]), reaches[enough - 1])
 
 
 def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
@@ -477,4 +459,11 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     data, unusable = prepare(pairs, weighted=False)
     for name, reason in unusable.items():
         raise FitError(f"Trial {name}: {reason}.")
-    return with_bands(fitted, data, predict_prepared(fitted, data))
+    banded, (discrepancy, reach) = predict_prepared(fitted, data), _calibrated(fitted)
+    for i, trial_data in enumerate(data):
+        # A trial that depends on a parameter that the fit does not determine has no band.
+        with suppress(SimulationError, FitError):
+            variance = _variance_of_new_trial(fitted, trial_data, banded[i])
+            variance += (discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
+            banded[i] = replace(banded[i], band_m=reach * np.sqrt(variance))
+    return banded

@@ -37,7 +37,13 @@ LENGTH_ERROR = 0.005  # Standard deviation of a vine's length, relative (chosen)
 
 
 class FitError(UserError, ValueError):
-    """The fit cannot be made; the message is one sentence with a remedy."""
+    """The fit cannot be made; the message is one sentence with a remedy.
+
+    >>> import vinetrack as vt
+    >>> vt.fit(vt.base_model(), [])
+    Traceback (most recent call last):
+    vinetrack.inference.fit_data.FitError: No trial can be fitted: there is none.
+    """
 
 
 @dataclass(frozen=True)
@@ -239,13 +245,13 @@ def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
 
 
 def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points whose stated error is several times that of the others, such as an edge half behind the door. Also the
-    position and end of the rest before the motion, where it consists of such points or is that of a recording: pictures
-    of one edge share its slow error, and together they are worth one point.
+    """Points whose stated error is several times that of the others, such as an edge half behind the door, and the rest
+    before the motion where it consists of them or is that of a recording: pictures of one edge share its slow error,
+    and together they are worth one point.
     """
-    sigma_m, share_an_error = track.lead_position_sigma_m, track.lead_position_systematic_m is not None
-    if track.lead_position_systematic_m is not None:
-        sigma_m = np.hypot(sigma_m, np.nan_to_num(track.lead_position_systematic_m))
+    sigma_m, slow_m = track.lead_position_sigma_m, track.lead_position_systematic_m
+    if slow_m is not None:
+        sigma_m = np.hypot(sigma_m, np.nan_to_num(slow_m))
     stated = usable & np.isfinite(sigma_m)
     if not stated.any():
         return np.zeros(usable.size, dtype=bool), None
@@ -256,9 +262,8 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
     usable_points = np.flatnonzero(usable)
     at_rest = usable_points[: _rest_before_motion(track.lead_position_m[usable_points])]
     imprecise_rest = None
-    if at_rest.size and (share_an_error or np.mean(imprecise[at_rest]) > 0.5):
-        # The few remaining points of such a rest would determine the origin alone.
-        imprecise[at_rest] = True
+    if at_rest.size and (slow_m is not None or np.mean(imprecise[at_rest]) > 0.5):
+        imprecise[at_rest] = True  # The few others would determine the origin alone.
         imprecise_rest = ImpreciseRest(
             release_s=float(track.time_s[at_rest[-1]]),
             origin_m=float(np.median(track.lead_position_m[at_rest])),
@@ -273,9 +278,9 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
 def _quantised_points(
     track: Track, usable: NDArray[np.bool_], rounding_m: float
 ) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points at standstill that rounding makes identical, because their noise is smaller than the rounding step. They
-    all have the same error, so that together they are worth one point. The rest before the motion is replaced by its
-    mean with the error of one point; of a standstill at the end the first point is kept.
+    """Points at standstill that rounding makes identical, because their noise is smaller than the rounding step: with
+    the same error they are worth one point together. The rest before the motion is replaced by its mean with the error
+    of one point; of a standstill at the end the first point is kept.
     """
     places = np.flatnonzero(usable)
     y = track.lead_position_m[places]
@@ -291,9 +296,9 @@ def _quantised_points(
 
 
 def _near_end_of_growth(trial: Trial, track: Track) -> tuple[NDArray[np.bool_], NDArray[np.int_]]:
-    """Frames on the last twentieth of the growth and after its end, but for the last one: a standstill at the end shows
-    how long the vine is, and is worth one point. All of them where the track begins in motion, and so does not tell how
-    far it has grown. Returns excluded, kept (index of the last frame, if it lies behind the end; shape (0,) or (1,)).
+    """Frames on the last twentieth of the growth and after its end, and the index of the last one if it is kept, in an
+    array: a standstill at the end shows how long the vine is, and is worth one point, unless the track begins in motion
+    and does not tell how far it has grown.
     """
     excluded = np.zeros(track.time_s.size, dtype=bool)
     points = np.flatnonzero(track.usable if trial.video else track.usable | with_flag(track.flag, "after_end"))
@@ -357,9 +362,9 @@ def none_to_fit(left_out: Mapping[str, str]) -> FitError:
 
 
 def not_measured(pairs: Pairs) -> dict[str, str]:
-    """Why the values of a trial were not measured in it, by its name: those of a copied track, and those of a gauge at
-    the end of its range, which stands at one value to the last digit: below a set pressure though it is noisy in other
-    trials, or at whatever pressure was set.
+    """Why the values of a trial were not measured in it, by its name: those of a copied track, and of a gauge at the
+    end of its range, at one value to the last digit: below a set pressure though noisy in other trials, or whatever was
+    set.
     """
     first_with: dict[bytes, str] = {}
     reasons, ending_at, is_noisy = dict[str, str](), dict[float, list[Trial]](), False
@@ -425,8 +430,8 @@ def _with_errors_of_length(data: list[FitTrial]) -> list[FitTrial]:
 
 
 def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
-    """The trials with weighted points, where the noise of imported positions varies from point to point. Points of this
-    package's tracker keep equal weights: it states the error of each and leaves out the worst.
+    """The trials with weighted points, where the noise of imported positions varies. Points of this package's tracker
+    keep equal weights: it states the error of each and leaves out the worst.
     """
     imported = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
     of_track = [[getattr(data[i], name) for i in imported] for name in ("time_s", "lead_position_m", "stated_m")]

@@ -139,9 +139,7 @@ def _interpolated_readings(pressure_Pa: Floats) -> tuple[Floats, Floats, float] 
 
 
 def _resolution(pressure_Pa: Floats) -> float:
-    """Resolution of pressures, Pa: the largest step of which they are all multiples, to within EXACT_TOLERANCE, by
-    Euclid's algorithm; 0 without one.
-    """
+    """The largest step, Pa, of which all pressures are multiples, by Euclid's algorithm; 0 without one."""
     exact_Pa = EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa)))
     remainders = np.unique(np.abs(pressure_Pa - pressure_Pa[0]))
     remainders = remainders[remainders > exact_Pa]
@@ -286,18 +284,15 @@ def noise_correlations(traces: Sequence[Floats]) -> list[float]:
     """Lag-one correlations that the noise of readings may have, the same in all traces: an estimate, others within two
     of its standard errors, and 0; that alone unless the estimate is significantly positive. If noise is correlated,
     third differences of readings COMPARED_LAG apart are larger than those of neighbours. A changing pressure has slow
-    differences too, but not in most traces, so the median over traces is used. Shapes: traces (n_readings,).
+    differences too, but not in most traces: the median over traces is used.
     """
     ratios, counts = [], []
     for readings_Pa in traces:
         distant = [readings_Pa[begin::COMPARED_LAG] for begin in range(COMPARED_LAG)]
         neighbour_sigma = white_noise_sd(readings_Pa) if distant[-1].size >= FEWEST_SAMPLES else 0.0
         if neighbour_sigma > NEGLIGIBLE_NOISE * abs(float(np.median(readings_Pa))):
-            # In coarse steps, distant readings may all be equal.
-            distant_variance = max(
-                float(np.mean([white_noise_sd(each) ** 2 for each in distant])), NEGLIGIBLE_NOISE * neighbour_sigma**2
-            )
-            ratios.append(math.log(distant_variance / neighbour_sigma**2))
+            variance_ratio = float(np.mean([white_noise_sd(each) ** 2 for each in distant])) / neighbour_sigma**2
+            ratios.append(math.log(max(variance_ratio, NEGLIGIBLE_NOISE)))  # Distant readings may all be equal.
             counts.append(readings_Pa.size)
     if not ratios:
         return [0.0]
@@ -461,9 +456,9 @@ def kinds_of_curves() -> tuple[list[Floats], ...]:
 
 
 def curves_of(factors: Floats, *kinds: Sequence[Floats]) -> tuple[Floats, Posterior]:
-    """Products of splines and readings, the constant eliminated, and the posterior of the coefficients over kinds of
-    curves, each sort with the same odds, and no curve, since a regulator keeps most pressures constant, with those of
-    all together. Shapes: factors (n_traces, q + 2, q + 2) → (n_traces, q + 1, q + 1).
+    """Products of splines and readings, (n_traces, q + 1, q + 1), the constant eliminated, and the posterior of the
+    coefficients over kinds of curves, each sort with the same odds, and no curve, since a regulator keeps most
+    pressures constant, with those of all together.
     """
     rows = factors[:, 1:, 1:]
     products = np.swapaxes(rows, 1, 2) @ rows
@@ -475,14 +470,14 @@ def curves_of(factors: Floats, *kinds: Sequence[Floats]) -> tuple[Floats, Poster
 
 
 def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
-    """Clock offset between gauge and camera, s: delay from a reading to the growth that belongs to it, the same in all
-    traces; and its standard deviation: those of the evidence of curves in growth at offsets of up to 60 frames.
+    """Delay from a reading to the growth that belongs to it, s, the same in all traces, and its standard deviation:
+    those of the evidence of curves in growth at offsets of up to 60 frames.
     """
     # 24: traces that tell the offset (chosen)
     telling = [trace for trace in traces if trace.growth is not None][:: len(traces) // 24 + 1]
     if not telling:
         return 0.0, 0.0
-    step_s = float(np.median([trace.growth.frame_s for trace in telling if trace.growth is not None]))
+    step_s = float(np.median([trace.growth.frame_s for trace in telling if trace.growth]))
     _, growth, both = kinds_of_curves()
     log_evidence: dict[int, float] = {}
     # 60, 4: largest offset and coarse steps, frames (chosen)
@@ -562,9 +557,7 @@ class Curves:
         self.log_likelihood = float(np.sum(without)) + self.found.log_evidence
 
     def all(self) -> Iterator[tuple[Floats, float, Floats]]:
-        """The pressure of every trace at all samples, Pa, the error of its mean, Pa, and one column per other error,
-        one standard deviation each.
-        """
+        """Of every trace pressure at all samples, standard deviation of its mean, and one of each other error, columns."""
         found = (self.found.mean, self.found.covariance)
         for trace, factor, mean, covariance in zip(self.traces, self.factors, *found, strict=True):
             constant = factor[0, -1] / factor[0, 0]
@@ -585,9 +578,9 @@ class Curves:
 
 
 def _splined(trace: Recorded, clock: tuple[float, float]) -> tuple[Floats, float, Floats]:
-    """A trace that no smooth function explains, by a smoothing spline through its readings, with knots where the
-    pressure bends (Dierckx, IMA J. Numer. Anal. 1, 267, 1981); of fewer than five readings lines. Its errors are those
-    of the curve through it alone, as much larger as that leaves more than noise.
+    """A trace that no smooth function explains, by a smoothing spline with knots where the pressure bends (Dierckx, IMA
+    J. Numer. Anal. 1, 267, 1981); of fewer than five readings lines. Its errors are those of the curve through it
+    alone, as much larger as that leaves more than noise.
     """
     from scipy.interpolate import UnivariateSpline
 
@@ -598,8 +591,7 @@ def _splined(trace: Recorded, clock: tuple[float, float]) -> tuple[Floats, float
     order, left = (1, 0.0) if places.size < 5 else (3, 0.85 * places.size)
     weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
     # ext=3: constant beyond the readings, from which a cubic runs away
-    spline = UnivariateSpline(places, values_Pa, weights, k=order, s=left, ext=3)
-    alone = Curves([trace], clock)
+    spline, alone = UnivariateSpline(places, values_Pa, weights, k=order, s=left, ext=3), Curves([trace], clock)
     ((_, mean_error_Pa, errors_Pa),) = alone.all()
     larger = math.sqrt(max(float(alone.excess[0]), 1.0))
     return np.asarray(spline(np.arange(float(trace.count)))), mean_error_Pa, larger * errors_Pa
