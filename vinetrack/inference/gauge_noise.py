@@ -557,7 +557,7 @@ class Curves:
         self.log_likelihood = float(np.sum(without)) + self.found.log_evidence
 
     def all(self) -> Iterator[tuple[Floats, float, Floats]]:
-        """Of every trace pressure at all samples, standard deviation of its mean, and one of each other error, columns."""
+        """Of every trace pressure at all samples, standard deviation of its mean, and of each other error, columns."""
         found = (self.found.mean, self.found.covariance)
         for trace, factor, mean, covariance in zip(self.traces, self.factors, *found, strict=True):
             constant = factor[0, -1] / factor[0, 0]

@@ -306,7 +306,7 @@ def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residu
     and errors of single trials, and the priors of release and origin add their pull, and their penalty at the current
     values.
     """
-    columns = np.s_[PRESSURE : state.trial_effects.shape[1]]
+    columns = list(range(PRESSURE, state.trial_effects.shape[1]))
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
     white[:, :, residual] += explained
@@ -399,10 +399,11 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
         own = np.r_[N_TRIAL_EFFECTS : problem.n_effects]
         order = np.r_[:PRESSURE, own, PRESSURE:N_TRIAL_EFFECTS, problem.n_effects : white.shape[-1]]
         white = white[:, order[:, None], order]
-    constant = np.sum(problem.points * np.log(2 * math.pi * state.variance))
-    constant -= np.sum(problem.stretches) * math.log(1 - state.rho**2) + np.sum(np.log(precision))
+    log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
     square = with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision)
-    return eliminated(white, precision)[0], float(constant + np.sum(np.linalg.slogdet(square)[1]))
+    log_alignment = np.sum(np.linalg.slogdet(square)[1] - np.log(precision).sum(axis=1))
+    constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
+    return eliminated(white, precision)[0], constant
 
 
 def deviances(

@@ -87,16 +87,11 @@ def subset(
         **{name: getattr(problem, name)[rows] for name in by_trial.split()},
         **{name: getattr(problem, name)[places] for name in by_parameter.split()},
     )
-    return (
-        smaller,
-        problem,
-        [
-            replace(
-                each, theta=each.theta[places], trial_effects=each.trial_effects[rows], variance=each.variance[rows]
-            )
-            for each in states
-        ],
-    )
+    reduced = [
+        replace(each, theta=each.theta[places], trial_effects=each.trial_effects[rows], variance=each.variance[rows])
+        for each in states
+    ]
+    return smaller, problem, reduced
 
 
 # ------------------------------------------------------------------------------

@@ -211,7 +211,7 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
     trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
     """
-    orders = np.arange(1, 5)  # Legendre orders of the shapes
+    orders, select = np.arange(1, 5), np.eye(5)[1:].T  # Legendre orders of the shapes
     sigma_m = [trial_data.position_systematic_m for trial_data in predictor.data]
     if not max(sigma_m) > 0:
         return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
@@ -220,7 +220,7 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
     return [
-        sigma * (np.polynomial.legendre.legvander(2 * np.clip(growth_m / reach, 0, 1) - 1, 4)[:, 1:] - (-1.0) ** orders)
+        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - (-1.0) ** orders)
         for growth_m, sigma in zip(grown_m, sigma_m, strict=True)
     ]
 

@@ -27,6 +27,7 @@ from scipy.special import ndtri_exp
 from vinetrack.core.problems import INTERNAL_ERROR, InputError, UserError, confirmed, remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json, write_text
+from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
@@ -302,21 +303,11 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
     """One row per vine, as `model_check.csv` holds it."""
     if EXPONENT not in [number.key for number in fit.numbers]:
         raise FitError("The exponent n was fixed in this fit: there is nothing to check the steady windows against.")
-    n = fit[EXPONENT]
-    rows = []
+    n, n_steady, rows = fit[EXPONENT], or_nan(damping.get("n")), []
     for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
-        steady = (damping.get("vines") or {}).get(vine)
+        steady, z = (damping.get("vines") or {}).get(vine), math.nan
         B = next((b for b in fit.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
-        n_steady = damping.get("n")
-        row: dict[str, object] = {
-            "vine": vine,
-            "n_steady": math.nan if n_steady is None else n_steady,
-            "n_trajectory": n.value,
-            "B_steady": steady["B"] if steady else math.nan,
-            "B_trajectory": B.value if B else math.nan,
-            "z": math.nan,
-        }
-        if steady and B and n_steady is not None:
+        if steady and B and math.isfinite(n_steady):
             difference = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
             # Covariances of n and ln B of the vine.
             names = damping["covariance"]["parameters"]
@@ -324,8 +315,8 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
             of_steady = np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
             k, slopes = [fit.numbers.index(n), fit.numbers.index(B)], np.array([1.0, 1 / B.value])
             of_trajectories = fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes
-            row["z"] = _deviate(difference, of_steady + of_trajectories)
-        rows.append(row)
+            z = _deviate(difference, of_steady + of_trajectories)
+        rows.append((vine, n_steady, n.value, steady["B"] if steady else math.nan, B.value if B else math.nan, z))
     return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
 
 
