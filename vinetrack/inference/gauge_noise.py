@@ -225,8 +225,8 @@ def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[
     places, values = [], []
     for begin, (slope, at_0), (next_slope, next_at_0) in zip(begins[1:], lines, lines[1:], strict=False):
         intersection = (next_at_0 - at_0) / (slope - next_slope) if slope != next_slope else begin - 0.5
-        places.append(float(np.clip(intersection, begin - 1, begin)))
-        values.append(0.5 * ((slope + next_slope) * places[-1] + at_0 + next_at_0))
+        places.append(place := float(np.clip(intersection, begin - 1, begin)))
+        values.append(0.5 * (slope * place + at_0 + next_slope * place + next_at_0))
     spacing, ends = float(np.median(np.diff(places))) if len(places) > 1 else 0.0, []
     for inner, end, (slope, at_0) in ((places[0], 0.0, lines[0]), (places[-1], pressure_Pa.size - 1.0, lines[-1])):
         shown_length = abs(end - inner)
