@@ -294,7 +294,7 @@ def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, lab
 def test_an_error_of_a_trace_is_estimated(fit):
     """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
     shapes = systematics_of(fit.predictor, fit.solution, ["gauge"])
-    assert not shapes.count
+    assert not shapes.sources
     moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.own]
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)

@@ -119,7 +119,7 @@ def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematic
     problem = errors.among(fixed_insensitive)
     start = replace(
         solution.state,
-        theta=np.append(solution.state.theta, np.zeros(errors.count)),
+        theta=np.append(solution.state.theta, np.zeros(len(errors.sources))),
         trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
     )
     columns = tuple(errors.beside(solution.columns))

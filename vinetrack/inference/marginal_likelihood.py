@@ -333,9 +333,9 @@ def levenberg_marquardt_step(
     linear model. Shapes: cross_products (n_trials, 3, k, k) → (n_free,), (n_trials, n_effects).
     """
     precision = trial_effect_prior(problem, state)[1]
-    white = _with_prior_gradient(cross_products, problem, state)
+    white = with_prior_gradient(cross_products, problem, state)
     damped = precision + damping * (np.einsum("nkk->nk", white)[:, : problem.n_effects] + precision)
-    reduced, response = eliminated(white, _held(damped, problem))
+    reduced, response = eliminated(white, held_releases(damped, problem))
     of_keys = np.ascontiguousarray(white[:, problem.n_effects :, problem.n_effects :])
     undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
     square = information + np.diag(damping * np.diag(undamped[0]))
@@ -352,17 +352,7 @@ def levenberg_marquardt_step(
     return step, trial_effect_step, predicted_decrease
 
 
-def trial_effect_step(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
-    """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
-    (n_trials, 4).
-    """
-    white = _with_prior_gradient(cross_products, problem, state)
-    precision = _held(trial_effect_prior(problem, state)[1], problem)
-    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], precision)
-    return solve_per_trial(square, white[:, :N_TRIAL_EFFECTS, -1:])[:, :, 0]
-
-
-def _held(precision: Floats, problem: MixedProblem) -> Floats:
+def held_releases(precision: Floats, problem: MixedProblem) -> Floats:
     """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine filmed
     at steady speed alone nothing tells the release: a full step would spoil that of all trials, and steps of several
     frames would undo what `optimiser.likelier_releases` finds, time and again.
@@ -372,7 +362,7 @@ def _held(precision: Floats, problem: MixedProblem) -> Floats:
     return held
 
 
-def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
+def with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
     """Whitened cross products; those of effects and residual, half a negative gradient, with the pull of priors."""
     white = whitened_products(cross_products, state)
     centre, precision = trial_effect_prior(problem, state)

@@ -30,14 +30,16 @@ from vinetrack.inference.marginal_likelihood import (
     MixedProblem,
     estimate_between_trial_sd,
     estimate_noise,
+    held_releases,
     levenberg_marquardt_step,
     log_likelihood,
     marginal,
     shared_penalty,
+    solve_per_trial,
     trial_effect_prior,
-    trial_effect_step,
     whitened_products,
     with_diagonal,
+    with_prior_gradient,
 )
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -105,7 +107,10 @@ def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: F
     so precise that a step of the shared parameters leaves the curved valley, to which this step returns.
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-    step = trial_effect_step(predictor.products(columns), problem, state)
+    white = with_prior_gradient(predictor.products(columns), problem, state)
+    precision = held_releases(trial_effect_prior(problem, state)[1], problem)
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], precision)
+    step = solve_per_trial(square, white[:, :N_TRIAL_EFFECTS, -1:])[:, :, 0]
     moved = replace(state, trial_effects=moved_effects(state.trial_effects, step))
     costs = trial_costs(predictor, problem, state, residuals_in(columns)), trial_costs(predictor, problem, moved)
     better = costs[1] < costs[0]

@@ -46,11 +46,6 @@ class Systematics:
     sources: Sequence[str]
     own: list[Floats]
 
-    @property
-    def count(self) -> int:
-        """Number of errors that trials share."""
-        return len(self.sources)
-
     def beside(self, columns: Sequence[Floats]) -> list[Floats]:
         """Columns of a fit with those of the errors: of single trials after their effects, of several before the
         residual. Shapes: columns (n_points, k) → (n_points, k + n_own + n_columns).
@@ -65,7 +60,7 @@ class Systematics:
         """The problem of a fit with the errors as further unknowns, each with a standard normal prior."""
         index = np.column_stack([problem.index, np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)])
         own = problem.own_errors + self.own[0].shape[1]
-        return replace(with_unknowns(problem, self.count), index=index, own_errors=own)
+        return replace(with_unknowns(problem, len(self.sources)), index=index, own_errors=own)
 
 
 # By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
@@ -122,33 +117,30 @@ def _changes_of(
 def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
     carried = [each.trial.payload_kg > 0 and each.trial.travel_ratio != 1 for each in predictor.data]
+    bodies = [round(each.trial.payload_kg, 9) if so else None for each, so in zip(predictor.data, carried, strict=True)]
     # 1e-2, 0.5: relative step of a payload's mass for its derivative (derived), and standard deviation of the mass in
     # addition to that of the sheet, in such steps
-    return {
-        i: (round(predictor.data[i].trial.payload_kg, 9), 0.5 * change_m)
-        for i, change_m in _changes_by(predictor, solution, "payload_kg", 1e-2, carried)
-    }
+    return _changes_by(predictor, solution, "payload_kg", 1e-2, 0.5, bodies)
 
 
 def _film_errors(predictor: Predictor, solution: Solution) -> Displaced:
     """Error of the film mass of each vine, `FILM_ERROR`."""
-    heavy = [each.trial.linear_density_kg_m > 0 for each in predictor.data]
-    return {
-        i: (predictor.data[i].trial.vine, change_m)
-        for i, change_m in _changes_by(predictor, solution, "film_density_kg_m3", FILM_ERROR, heavy)
-    }
+    vines = [each.trial.vine if each.trial.linear_density_kg_m > 0 else None for each in predictor.data]
+    return _changes_by(predictor, solution, "film_density_kg_m3", FILM_ERROR, 1.0, vines)
 
 
 def _changes_by(
-    predictor: Predictor, solution: Solution, name: str, step: float, varied: Sequence[bool]
-) -> Iterator[tuple[int, Floats]]:
-    """`_changes_of` the varied trials where a field of the sheet is larger by a relative step."""
+    predictor: Predictor, solution: Solution, name: str, step: float, sigma: float, groups: Sequence[Hashable]
+) -> Displaced:
+    """Displacement where a field of the sheet is larger by a relative step times `sigma`; none of a trial without
+    group.
+    """
     larger = [
         (i, replace(each, trial=replace(each.trial, **{name: (1 + step) * getattr(each.trial, name)})))
         for i, each in enumerate(predictor.data)
-        if varied[i]
+        if groups[i] is not None
     ]
-    return _changes_of(predictor, solution, larger)
+    return {i: (groups[i], sigma * change_m) for i, change_m in _changes_of(predictor, solution, larger)}
 
 
 def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
