@@ -389,16 +389,6 @@ def film_influence(fit: Fit) -> Floats:
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
 
 
-def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...]:
-    """A message on the film mass where it matters as much as the stated errors, else none."""
-    sigma = np.array([number.sigma for number in numbers])
-    ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
-    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= 1]
-    shown = [(numbers[k], moved[k], *numbers[k].shown) for k in affected]
-    changes = [(number.title, factor * size, unit) for number, size, unit, factor in shown]
-    return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
-
-
 # ------------------------------------------------------------------------------
 # What a fit states: numbers, trials, and messages that warn of them or tell what was done to the data.
 
@@ -584,14 +574,19 @@ def trial_fit(
 
 
 def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
-    """The summary of a fit."""
-    moved = film_influence(fit)
+    """The summary of a fit, with a message on the film mass where it matters as much as the stated errors."""
+    moved, sigma = film_influence(fit), np.array([number.sigma for number in fit.numbers])
+    ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
+    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= 1]
+    shown = [(fit.numbers[k].title, moved[k], *fit.numbers[k].shown) for k in affected]
+    changes = [(title, factor * size, unit) for title, size, unit, factor in shown]
+    messages = [*fit.messages, *([remark("film_matters", error=FILM_ERROR, changes=changes)] if affected else [])]
     same = "numbers covariance spreads noise_m noise_correlation chi2_per_dof log_likelihood converged left_out"
     return FitSummary(
         **{name: getattr(fit, name) for name in same.split()},
         names=tuple(fit.model.names),
         moved_by_film=moved,
-        messages=tuple(map(str, (*fit.messages, *film_messages(fit.numbers, moved), *further_messages))),
+        messages=tuple(map(str, (*messages, *further_messages))),
         warnings=tuple(warnings),
         trials={trial.name: TrialEstimates(*(getattr(trial, name) for name in ESTIMATES)) for trial in fit.trials},
     )

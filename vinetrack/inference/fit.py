@@ -297,14 +297,13 @@ def fit(
     data, left_out = prepare(pairs, weighted=noise is None)
     if not data:
         raise none_to_fit(left_out)
-    fixed, free = tuple(fixed), tuple(free)
-    options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
+    options: dict[str, Any] = {"fixed": tuple(fixed), "free": tuple(free), "shared": dict(shared or {})}
     fixed_terms = FixedTerms(spreads)
     if noise is not None:
         noise_m, rho = noise
         data = [replace(trial_data, noise_m=noise_m, correlation=rho) for trial_data in data]
         fixed_terms = FixedTerms(spreads, (rho, np.full(len(data), noise_m**2 * (1 - rho**2))))
-    layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
+    layout = make_layout(model.with_values(start or {}), data, **options)
     predictor = Predictor(layout, data, host)
     try:
         solution = solve_from(predictor, best_start(predictor), fixed_terms, watch=watch)
@@ -317,8 +316,7 @@ def fit(
             f"The model {' + '.join(model.names)} moves no trial. Check growth_angle_deg (0 is straight down),"
             " pressure_kPa and yield_pressure_kPa, or add the effect that drives them to `model:`."
         )
-    fitted = assemble(predictor, solution, left_out, options)
-    return replace(fitted, pairs=pairs)
+    return replace(assemble(predictor, solution, left_out, options), pairs=pairs)
 
 
 def refit(
@@ -386,19 +384,15 @@ def refit(
     fitted_values = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**fitted_values, **(start or {})})
     data = before.predictor.data
-    names = {*model.parameter_names, "yield_pressure.P_y"}
-    options_used = {
-        key: tuple(name for name in before.options[key] if _names_parameter(name, names))
-        if given is None
-        else tuple(given)
+    names = {part for name in (*model.parameter_names, YIELD_PRESSURE) for part in (name, name.split(".")[1])}
+    options: dict[str, Any] = {
+        key: tuple(name for name in before.options[key] if name in names) if given is None else tuple(given)
         for key, given in (("fixed", fixed), ("free", free))
     }
     all_shared = {**before.options["shared"], **(shared or {})}
-    shared_used = {name: how for name, how in all_shared.items() if _names_parameter(name, names)}
-    between = before.predictor.layout.between if between is None else tuple(between)
-    layout = make_layout(
-        model, data, fixed=options_used["fixed"], free=options_used["free"], shared=shared_used, between=between
-    )
+    options["shared"] = {name: how for name, how in all_shared.items() if name in names}
+    between = before.predictor.layout.between if between is None else between
+    layout = make_layout(model, data, **options, between=between)
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
@@ -418,12 +412,7 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, held, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    fitted = assemble(predictor, solution, before.left_out, {**options_used, "shared": shared_used})
-    return replace(fitted, pairs=before.pairs)
-
-
-def _names_parameter(name: str, names: Iterable[str]) -> bool:
-    return any(name in (full, full.split(".")[1]) for full in names)
+    return replace(assemble(predictor, solution, before.left_out, options), pairs=before.pairs)
 
 
 def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
