@@ -117,7 +117,7 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
 
 
 def _leave_one_out(fit: Fit, information: Floats, scores: Floats, i: int) -> tuple[Floats, Floats] | None:
-    """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
+    """Residual of a trial once left out of the fit, m, and its variance, m², to first order; None where the other
     trials do not determine all parameters on which it depends.
     """
     problem, state, columns = fit.solution.problem, fit.solution.state, fit.solution.columns[i]
@@ -166,8 +166,8 @@ def _variance_of_new_trial(fit: Fit, trial_data: FitTrial, trial: TrialFit) -> F
 
 
 def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
-    """The parameters of a fit as the layout of one trial holds them. Returns theta (scaled; those of its vine and its
-    day where each has its own), places (indices among the numbers of the fit, -1 for new ones). Shape (n_free,).
+    """The scaled parameters of a fit as the layout of one trial holds them, those of its vine and its day where each
+    has its own, and their places among the numbers of the fit, -1 for new ones.
     """
     theta, places = layout.start, np.full(len(layout.free), -1)
     trial = trial_data.trial

@@ -449,9 +449,8 @@ class Fit(NumberTable, Drawn):
 
     @property
     def state(self) -> FitState:
-        """State of the solution, with the variance components of the fit that includes the systematic errors. The
-        iterations are without them, so that the displacement by a lens is taken for deviations of single
-        trials and enlarges noise and standard deviations.
+        """State of the solution, with the variance components of the fit that includes the systematic errors: without
+        them the displacement by a lens is taken for deviations of single trials and enlarges these.
         """
         state, with_errors = self.solution.state, self.with_errors
         if with_errors is None:
@@ -511,9 +510,8 @@ Stored = Annotated[Floats, PlainValidator(_array), PlainSerializer(lambda array:
 
 @dataclass(frozen=True, repr=False)
 class FitSummary(NumberTable, JsonRecord):
-    """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field. `names` are
-    those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the audit.
-    `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
+    """The quoted results of a fit, as `fit.json` holds them: `names` are those of the effects, `warnings` those of the
+    audit. `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
     """
 
     names: Annotated[tuple[str, ...], Field(alias="model")] = ()

@@ -38,9 +38,7 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
 
 @np.errstate(over="ignore", invalid="ignore")
 def at_correlation(cross_products: Floats, rho: float | Floats) -> Floats:
-    """Whitened cross products at a given correlation, for innovations of variance 1. Shapes: cross_products (n_trials,
-    3, k, k) → (n_trials, k, k).
-    """
+    """Whitened cross products, (n_trials, k, k), at a given correlation, for innovations of variance 1."""
     return np.asarray(cross_products[:, 0] - rho * cross_products[:, 1] + rho**2 * cross_products[:, 2])
 
 
@@ -104,9 +102,9 @@ def product_of_modes(roots: Sequence[Floats]) -> Floats:
 
 
 class Posterior(NamedTuple):
-    """Coefficients given data, averaged over priors and amplitudes by their likelihood. Shapes: mean (..., q),
-    covariance (..., q, q). `log_evidence` is relative to coefficients of 0; `hypothesis`, the place of a prior, and
-    `amplitude` are the most likely.
+    """Mean, (..., q), and covariance of coefficients given data, averaged over priors and amplitudes by their
+    likelihood. `log_evidence` is relative to coefficients of 0; `hypothesis`, the place of a prior, and `amplitude` are
+    likeliest.
     """
 
     mean: Floats

@@ -370,9 +370,7 @@ class FixedTerms:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iterations ended. `columns` are the sensitivities and residuals of each trial at `state`
-    (`Predictor.linearise`), `cross_products` their sums of products (`gaussian_processes.products`).
-    """
+    """Where the iterations ended, with sensitivities and residuals of each trial there, and their cross products."""
 
     state: FitState
     problem: MixedProblem

@@ -96,8 +96,8 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
 def _changes_of(
     predictor: Predictor, solution: Solution, varied: Sequence[tuple[int, FitTrial]]
 ) -> Iterator[tuple[int, Floats]]:
-    """Indices of trials, each as it is or as it might be, and the change of their positions, m, shape (n_points, 1);
-    nothing where one cannot be simulated.
+    """Indices of trials as they might be, and changes of position, (n_points, 1); nothing where one cannot be
+    simulated.
     """
     if not varied:
         return
@@ -153,8 +153,8 @@ def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
 
 
 def _gauge_errors(predictor: Predictor, solution: Solution) -> list[Floats]:
-    """Displacement by the errors that gauge noise leaves in each recorded pressure, except that of its mean, which is
-    part of the fit, m; the same number for every trial, zero beyond its own. Shape (n_points, n_errors).
+    """Displacement by the errors that gauge noise leaves in each recorded pressure, but that of its mean, which is part
+    of the fit: (n_points, n_errors), the same number for every trial.
     """
     misread = [
         (i, replace(each, trace=(each.trace[0], each.trace[1] + error_Pa)))
