@@ -347,7 +347,8 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 def relative_residuals(predictor: Predictor, solution: Solution) -> Floats:
     """Root mean square residual of each trial, relative to its observed growth, shape (n_trials,)."""
     rms_m = [math.sqrt(float(np.mean(columns[:, -1] ** 2))) for columns in solution.columns]
-    return np.asarray(rms_m / np.maximum(predictor.spans_m, 1e-9))
+    spans_m = [float(np.ptp(each.lead_position_m)) for each in predictor.data]
+    return np.asarray(rms_m / np.maximum(spans_m, 1e-9))
 
 
 MOST_ITERATIONS = 60  # Maximum number of steps (chosen)
