@@ -273,6 +273,17 @@ def trace_off(low_ms: float, high_ms: float) -> Fault:
     return apply
 
 
+def lagging_gauge(low_ms: float, high_ms: float) -> Fault:
+    """The pressure is recorded along, by a gauge of such a time constant."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        lag = float(draw.uniform(low_ms, high_ms)) / 1e3
+        camera = replace(laboratory.camera, trace_late_s=0.0, gauge_lag_s=lag)
+        return replace(laboratory, camera=camera).known(gauge_lag_s=lag)
+
+    return apply
+
+
 def slow_gauge(low_Hz: float, high_Hz: float, sigma_Pa: float, **how: Any) -> Fault:
     """The pressure is read so many times a second, fewer than there are frames, with noise; `how` as of `Camera`."""
 

@@ -230,6 +230,14 @@ def _camera_rows() -> list[Row]:
             Wants(payload=False, chamber=True),
             least_sigma=CLEAR,
         ),
+        Row(
+            "gauge_lag",
+            "gauge_lag",
+            _names("*lag*"),
+            (faults.physics(gamma=1.3), faults.lagging_gauge(3, 20)),
+            Wants(payload=False, chamber=True),
+            least_sigma=CLEAR,
+        ),
         Row("gauge_slow", "gauge_slow", ADEQUATE, (faults.slow_gauge(40, 150, 100.0),)),
         Row(
             "gauge_slow_depletion",

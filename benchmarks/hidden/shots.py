@@ -55,12 +55,12 @@ class Camera:
     edge. `wild_share` of the points are off by `wild_m`, evenly drawn. The lens adds k₃ u³ + k₅ u⁵, u from
     `lens_centre_m`; a camera that is tilted shows y (1 + `bow_per_m` y). The rows of the picture are read
     `row_delay_s_m` later by the metre; `scale` and `clock` are relative errors. `trace_late_s`: by how much the clock
-    of a recorded pressure is ahead (NaN: none is recorded); its gauge has noise `trace_sigma_Pa`, of correlation
-    `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every frame) in multiples of
-    `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`, repeated. The file has
-    multiples of `trace_digit_Pa`. Positions are `smoothed` over so many frames by polynomials of `smoothed_degree`, 0 a
-    moving average; at either end by as many frames as there are, as spreadsheets do. One frame in `kept_every` is
-    looked at, and its position written in multiples of `digit_m`.
+    of a recorded pressure is ahead (NaN: none is recorded); its gauge, of time constant `gauge_lag_s`, has noise
+    `trace_sigma_Pa`, of correlation `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every
+    frame) in multiples of `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`,
+    repeated. The file has multiples of `trace_digit_Pa`. Positions are `smoothed` over so many frames by polynomials of
+    `smoothed_degree`, 0 a moving average; at either end by as many frames as there are, as spreadsheets do. One frame
+    in `kept_every` is looked at, and its position written in multiples of `digit_m`.
     """
 
     noise_m: float
@@ -76,6 +76,7 @@ class Camera:
     scale: float = 0.0
     clock: float = 0.0
     trace_late_s: float = math.nan
+    gauge_lag_s: float = 0.0
     trace_sigma_Pa: float = 50.0
     gauge_Hz: float = math.nan
     gauge_rho: float = 0.0
@@ -237,7 +238,7 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     position[wild] += draw.choice([-1, 1], int(wild.sum())) * draw.uniform(*camera.wild_m, int(wild.sum()))
     trace = None
     if math.isfinite(camera.trace_late_s):
-        trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera.trace_late_s)[:stop], camera, draw) / 1e3
+        trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera)[:stop], camera, draw) / 1e3
     position = _smoothed(position, camera)
     if camera.digit_m > 0:
         position = np.round(position / camera.digit_m) * camera.digit_m
@@ -282,9 +283,16 @@ def imaged(y: Floats, camera: Camera) -> Floats:
     return (y + camera.lens_k3 * u**3 + camera.lens_k5 * u**5) * (1 + camera.scale)
 
 
-def gauge(times: Floats, pressure_Pa: Floats, late_s: float) -> Floats:
-    """Pressure as a gauge tells it whose clock is ahead."""
-    return np.interp(times + late_s, times, pressure_Pa)
+def gauge(times: Floats, pressure_Pa: Floats, camera: Camera) -> Floats:
+    """Pressure as a gauge tells it that is slow and whose clock is ahead; before the first time it was constant."""
+    shown_Pa = pressure_Pa.copy()
+    if camera.gauge_lag_s > 0:
+        # Exact for a pressure that changes linearly from time to time
+        for k, step_s in enumerate(np.diff(times)):
+            u, slope = step_s / camera.gauge_lag_s, (pressure_Pa[k + 1] - pressure_Pa[k]) / step_s
+            behind = shown_Pa[k] - pressure_Pa[k] + slope * camera.gauge_lag_s
+            shown_Pa[k + 1] = pressure_Pa[k + 1] - slope * camera.gauge_lag_s + behind * math.exp(-u)
+    return np.interp(times + camera.trace_late_s, times, shown_Pa)
 
 
 def reported(shot: Shot, camera: Camera, since: Floats) -> tuple[Floats, Floats, Floats]:

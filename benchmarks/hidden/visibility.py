@@ -67,7 +67,7 @@ def _filmed(shot: Shot, camera: Camera) -> _Trial:
     count = stop / every.size * (1 - camera.rho) / (1 + camera.rho)
     trace = None
     if math.isfinite(camera.trace_late_s):
-        trace = since, gauge(since, gauge_Pa, camera.trace_late_s)
+        trace = since, gauge(since, gauge_Pa, camera)
     return _Trial(shot, since[every], y[every], math.sqrt(count) / camera.noise_m, trace)
 
 

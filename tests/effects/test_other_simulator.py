@@ -29,14 +29,14 @@ from vinetrack.effects import Effect, TrialInputs, catalogue
 
 B = 6.44
 DAMPING = {"eversion_damping.B": B, "eversion_damping.n": N}
-WRITTEN_OUT = ("growth_angle", "lens", "moving_average", "rolling_shutter", "supply_rise", "trace_clock")
+WRITTEN_OUT = ("gauge_lag", "growth_angle", "lens", "moving_average", "rolling_shutter", "supply_rise", "trace_clock")
 """Effects that are held against a vine written out by hand instead, below."""
 
 TIMES = FRAME_S * np.arange(-3, 1200)
 PACKAGE = Path(vt.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 MIXTURE_TIMES = np.linspace(0.0, 0.3, 200)
-DRAWN_LAST = ("film_mass", "payload_mass")
+DRAWN_LAST = ("film_mass", "payload_mass", "gauge_lag")
 """Effects that came after the seeds, in the order in which they came: the others keep their sizes."""
 FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
 FINE = np.linspace(0, 0.15, 50)
@@ -351,3 +351,15 @@ def test_the_clock_of_a_trace_shifts_the_pressure_that_drives():
     got = simulated(LOADED, {"trace_clock.delta": delay}, FINE, (clock, pressure)).observed_position_m
     np.testing.assert_allclose(got, late, rtol=0, atol=1e-12)
     assert np.max(np.abs(simulated(LOADED, {}, FINE, (clock, pressure)).lead_position_m - late)) > 9e-4
+
+
+def test_a_pressure_is_what_a_gauge_that_lags_should_have_shown():
+    """A ramp a t, of which it shows a (t − τ (1 − e^(−t/τ)))."""
+    lag, clock = 4e-3, np.linspace(0.0, 0.3, 3001)
+    shown, true = 2e5 * (clock + lag * np.expm1(-clock / lag)), 2e5 * clock
+    expected, got, late = (
+        simulated(LOADED, {"gauge_lag.tau": tau}, FINE, (clock, pressure)).lead_position_m
+        for tau, pressure in ((0.0, true), (lag, shown), (0.0, shown))
+    )
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5)
+    assert np.max(np.abs(late - expected)) > 9e-4

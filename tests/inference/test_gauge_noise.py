@@ -82,14 +82,14 @@ def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exponent", [1.0, 1.4])
-def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent):
-    """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
-    pressure_Pa = 115e3 * (1 + 0.2 * GROWTH_M / exponent) ** -exponent - 101_325.0
+@pytest.mark.parametrize(("exponent", "noise_Pa"), [(1.0, 5.0), (1.4, 5.0), (1.0, 50.0), (1.4, 50.0)])
+def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent, noise_Pa):
+    """The error that twenty traces share is no larger than their noise makes it."""
+    pressure_Pa = 115e3 * (1 + 0.3 * GROWTH_M / exponent) ** -exponent - 101_325.0
     draws = [np.random.default_rng(300 + seed).standard_normal(TIMES_S.size) for seed in range(20)]
-    quiet = gauge.denoised_traces([as_track(TIMES_S, GROWTH_M, pressure_Pa + 5.0 * draw) for draw in draws])
+    quiet = gauge.denoised_traces([as_track(TIMES_S, GROWTH_M, pressure_Pa + noise_Pa * draw) for draw in draws])
     off = np.array([trace.pressure_Pa - pressure_Pa for trace in quiet])
-    assert np.max(np.abs(np.mean(off, axis=0))) < 1.0
+    assert np.std(np.mean(off, axis=0)) < 0.3 + 0.02 * noise_Pa
 
 
 def test_a_corner_between_two_readings_is_where_the_growth_begins():
@@ -292,17 +292,27 @@ def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, lab
 
 
 def test_an_error_of_a_trace_is_estimated(fit):
-    """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
+    """A trace bent by two of its standard deviations, in the trial that its bend moves most, is bent back."""
     shapes = systematics_of(fit.predictor, fit.solution, ["gauge"])
+<<<<<<< HEAD
     assert not shapes.sources
     moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.own]
+=======
+    assert not shapes.count
+    moves_m = [np.max(np.abs(columns[:, 1])) for columns in shapes.own]
+>>>>>>> db846613 (A gauge that lags is an effect; a chamber's pressure may bend by a hundredth of its fall: n of depleting chambers was 3 to 6 standard errors off)
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)
     clock_s, pressure_Pa = data[which].trace
-    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 0]))
+    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 1]))
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
+<<<<<<< HEAD
     solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
     after, place = with_systematics(moved, solution).solution.state, (which, N_TRIAL_EFFECTS)
+=======
+    solution = solving.solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
+    after, place = with_systematics(moved, solution).solution.state, (which, N_TRIAL_EFFECTS + 1)
+>>>>>>> db846613 (A gauge that lags is an effect; a chamber's pressure may bend by a hundredth of its fall: n of depleting chambers was 3 to 6 standard errors off)
     assert after.trial_effects[place] - fit.with_errors.trial_effects[place] == pytest.approx(-2.0, abs=0.5)
 
 

@@ -62,7 +62,7 @@ def evaluate(
         **{"time": time, "lead_position": position, "lead_velocity": velocity, "observed": position},
         **{"tail_position": rig.travel_ratio * position, "tail_velocity": rig.travel_ratio * velocity},
         **{"pressure": rig.set_pressure * ones, "moving_mass": ones, "damping_gain": ones},
-        **{"bend_angle": sum(angles, nothing), "tail_tension": nothing},
+        **{"bend_angle": sum(angles, nothing), "tail_tension": nothing, "pressure_slope": nothing},
     }
     state = State(**fields)
     film = np.prod([ones, *hooks.each("film_gain", state)], axis=0)
@@ -73,7 +73,8 @@ def evaluate(
     state = hooks.changed("yield_gauge", state._replace(set_pressure=state.pressure))
     if measured_Pa is not None:
         measured: Any = np.asarray(measured_Pa, dtype=float)
-        state = hooks.changed("gauge", state._replace(pressure=measured))
+        slope: Any = np.gradient(measured, time) if time.size > 1 else nothing
+        state = hooks.changed("gauge", state._replace(pressure=measured, pressure_slope=slope))
     elif hooks.calls.get("chamber_rate"):
         state = state._replace(pressure=_chamber_pressure(hooks, state))
     state = hooks.changed("damping_gain", _with_consistent_area(hooks, state))

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numba
 import numpy as np
@@ -40,7 +41,7 @@ from vinetrack.effects import Effect, State, TrialInputs
 
 _STATE = (
     "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
-    "tension, seen)"
+    "tension, seen, 0.0)"
 )
 
 
@@ -103,7 +104,6 @@ def {name}({arguments}):
     set_pressure = pressure
     if measured:
         pressure = trace_at(time, trial)
-        {calls("gauge", "pressure =", 8)}
     {"else: pressure = chamber" if has_chamber else ""}
     {calls("yield_gauge", "yield_pressure =")}
     {losses}
@@ -287,17 +287,19 @@ def lay_out(
         on = effects_on(model, thetas)
     breakpoints, stops = _limits(model, inputs, thetas, on, bends)
     samples = [np.empty(0) if trace is None else trace[0] for trace in traces] if traces else [np.empty(0)] * count
-    pressures = [trace[1] for trace in traces or () if trace is not None]
     sampled, trace_starts = np.concatenate([np.empty(0), *(samples if traces else ())]), starts_of(samples)
+    clocks = model, inputs, thetas, on
+    trace_time = _true(*clocks, "trace_time", trace_starts, sampled)
+    read_Pa = np.concatenate([np.empty(0), *(trace[1] for trace in traces or () if trace is not None)])
     arrays = BatchArrays(
         starts=starts,
-        times=_true_times(model, "true_time", inputs, thetas, on, stamps, starts),
+        times=_true(*clocks, "true_time", starts, stamps),
         on=on,
         inputs=inputs,
         thetas=thetas,
         trace_starts=trace_starts,
-        trace_time=_true_times(model, "trace_time", inputs, thetas, on, sampled, trace_starts),
-        trace_pressure=np.concatenate([np.empty(0), *pressures]),
+        trace_time=trace_time,
+        trace_pressure=_true(*clocks, "gauge", trace_starts, trace_time, read_Pa),
         bend_starts=starts_of(bends),
         bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
         breakpoints=breakpoints,
@@ -353,17 +355,24 @@ def _limits(
     return np.sort(np.vstack([floor_x_m, aligned * np.asarray(rig.travel_ratio)]).T, axis=1), end
 
 
-def _true_times(
-    model: Model, hook: str, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats,
-    starts: NDArray[np.int64],
+def _true(
+    model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], hook: str, starts: NDArray[np.int64],
+    time_s: Floats, read_Pa: Floats | None = None,
 ) -> Floats:  # fmt: skip
-    """True times since release of the stamps of all trials, by the effects on the clock that stamped them."""
-    true_times = stamps.copy()
+    """True times since release of stamps, or true pressures of readings at these times, of all trials, by the effects
+    on the clock or the gauge. Shapes: time_s, read_Pa (n_times,).
+    """
+    true = (time_s if read_Pa is None else read_Pa).copy()
     for effect, function, place in model.hooks[hook]:
         for i in np.flatnonzero(on[:, effect] & (np.diff(starts) > 0)).tolist():
-            own = true_times[starts[i] : starts[i + 1]]
-            own[:] = function(_NOTHING._replace(time=own), TrialInputs(*inputs[i]), *thetas[i, place])  # type: ignore[arg-type]
-    return true_times
+            part = slice(starts[i], starts[i + 1])
+            own, time = true[part], time_s[part]
+            known: dict[str, Any] = {"time": own}
+            if read_Pa is not None:
+                known = {"time": time, "pressure": own}
+                known["pressure_slope"] = np.gradient(own, time) if own.size > 1 else np.zeros(1)
+            own[:] = function(_NOTHING._replace(**known), TrialInputs(*inputs[i]), *thetas[i, place])
+    return true
 
 
 # ------------------------------------------------------------------------------

@@ -181,7 +181,7 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
 _STATE = State(
     time=0.05, lead_position=0.1, lead_velocity=1.5, tail_position=0.2, tail_velocity=3.0, set_pressure=28e3,
     pressure=27e3, yield_pressure=3e3, area=4.5e-4, linear_density=0.018, moving_mass=0.039, damping_gain=1.1,
-    bend_angle=0.5, tail_tension=2.0, observed=0.101,
+    bend_angle=0.5, tail_tension=2.0, observed=0.101, pressure_slope=-5e3,
 )  # fmt: skip
 _RIG = TrialInputs.of(replace(REFERENCE_TRIAL, bends=(Bend(0.1, 0.1, 0.1),)))
 

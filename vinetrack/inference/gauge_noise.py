@@ -447,8 +447,8 @@ def kinds_of_curves() -> tuple[list[Floats], ...]:
     )
     lengths = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8)  # in time, parts of a trace (chosen)
     in_time = [over_time, *(product_of_modes([root_of_covariance(TIME_SPLINES, length)]) for length in lengths)]
-    # 0.1: by how much a chamber's pressure departs from the line, as a part of its fall (chosen)
-    in_growth = [line, np.hstack([line, 0.1 * smooth]), smooth, bent]
+    # 0.01, 0.1: by how much a chamber's pressure departs from the line, as a part of its fall (chosen)
+    in_growth = [np.hstack([line, 0.01 * smooth]), np.hstack([line, 0.1 * smooth]), smooth, bent]
     time = [np.vstack([modes, np.zeros((GROWTH_SPLINES, modes.shape[1]))]) for modes in in_time]
     growth = [np.vstack([np.zeros((TIME_SPLINES, modes.shape[1])), modes]) for modes in in_growth]
     both = [np.hstack([modes, growth[1]]) for modes in (time[0], *time[-3:])]
