@@ -83,8 +83,8 @@ class SmallPictures:
         sampled = small[:, ::4, ::4] + np.float32(1.0)
         gain = np.median(sampled / sampled[len(luma) // 2], axis=(1, 2))
         small /= np.clip(gain, 0.2, 5.0)[:, None, None]
-        self.frames = small * np.float32(255.0 / max(float(small.max()), 1.0))
-        self._busy = busy_pictures(self.frames)
+        small *= np.float32(255.0 / max(float(small.max()), 1.0))
+        self.frames, self._busy = small, busy_pictures(small)
 
     @cached_property
     def changed(self) -> Pixels:

@@ -114,18 +114,20 @@ def film_evidence(
 def votes(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, weight: np.ndarray
 ) -> np.ndarray:
-    """Weighted sum over rows of a pixel's distance from the `last` picture less that from the `first`, by column.
-    Shapes: first, last, weight (n_across, n_along) → (n_frames, n_along).
+    """Weighted sum over rows of a pixel's distance from the `last` picture less that from the `first`, and sum of the
+    squares of the latter, by column. Shapes: first, last, weight (n_across, n_along) → (2, n_frames, n_along).
     """
     n, rows, columns = strip.shape
-    out = np.zeros((n, columns), np.float32)
+    out = np.zeros((2, n, columns), np.float32)
     for t in range(n):
-        gain, level, scores = np.float32(scale[t]), np.float32(offset[t]), out[t]
+        gain, level, scores, squares = np.float32(scale[t]), np.float32(offset[t]), out[0, t], out[1, t]
         for u in range(rows):
             values, begin, end, share = strip[t, u], first[u], last[u], weight[u]
             for s in range(columns):
                 value = np.float32(values[s]) * gain + level
-                scores[s] += (abs(value - end[s]) - abs(value - begin[s])) * share[s]
+                change = value - begin[s]
+                scores[s] += (abs(value - end[s]) - abs(change)) * share[s]
+                squares[s] += change * change
     return out
 
 
