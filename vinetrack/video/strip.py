@@ -261,20 +261,19 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
     every = np.flatnonzero(basis[0] > 0)[::4]  # pixels of which medians are taken: black ones tell no gain (derived)
     typical = float(_medians(basis[:1, every])[0])
     products, inverse = (basis[:, None] * basis).reshape(16, -1), np.linalg.inv(basis @ basis.T + ridge)
-    parts = slice(basis.shape[1] // 2), slice(basis.shape[1] // 2, None), slice(None)
-    found = []
+    parts, found = (slice(basis.shape[1] // 2), slice(basis.shape[1] // 2, None)), []
     for k in range(0, len(luma), 32):  # 32: frames at once, few enough for the processor's cache (derived)
         values = _pixels(luma[k : k + 32], places, None if shift_px is None else shift_px[k : k + 32]).astype(float)
-        residual = np.abs(values - values @ basis.T @ inverse @ basis)
-        scale = 1.4826 * _medians(residual[:, every]) + 0.3  # with rounding to whole grey levels
-        # outliers of a change of brightness alone, where that fits better
-        of_gain = np.abs(values - (_medians(values[:, every]) / typical)[:, None] * basis[0])
-        gain_scale = 1.4826 * _medians(of_gain[:, every]) + 0.3
-        residual[gain_scale < scale] = of_gain[gain_scale < scale]
-        scale = np.minimum(scale, gain_scale)
-        inlier = (residual < 4 * scale[:, None]).astype(float)
+        # outliers of the model, or of a change of brightness alone, where that fits better
+        some, models = values[:, every], [values @ basis.T @ inverse, np.zeros((len(values), len(basis)))]
+        models[1][:, 0] = _medians(some) / typical
+        scales = [_medians(np.abs(some - model @ basis[:, every])) for model in models]
+        scale = 1.4826 * np.minimum(*scales) + 0.3  # with rounding to whole grey levels
+        model = np.where((scales[1] < scales[0])[:, None], *models[::-1])
+        inlier = (np.abs(values - model @ basis) < 4 * scale[:, None]).astype(float)
         normal = np.stack([inlier[:, part] @ products[:, part].T for part in parts])
         right = np.stack([(values * inlier)[:, part] @ basis[:, part].T for part in parts])
+        normal, right = (np.concatenate([of_parts, of_parts.sum(axis=0)[None]]) for of_parts in (normal, right))
         of_frame = np.linalg.inv(normal.reshape(3, -1, 4, 4) + ridge * np.reshape([0.5, 0.5, 1.0], (3, 1, 1, 1)))
         error = scale[:, None] * np.sqrt(np.maximum(of_frame[..., [2, 3], [2, 3]], 0.0))
         found.append(np.concatenate([(of_frame @ right[..., None])[..., 0], error], axis=2))
