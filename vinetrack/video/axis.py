@@ -594,13 +594,15 @@ def _line_through(
     """The line along which most change is collected in order, or an empty one. The best of those `tried` (direction and
     point), by what is `likely` within `band`, is refined until its band, at most `most_band`, no longer widens.
     """
-    places, collected = np.column_stack([pixels.x, pixels.y]), []
-    for angle, middle in tried:
-        x, y = _along_and_side(angle) @ (places - middle).T
-        collected.append(float(likely[_on_front(pixels._replace(x=x, y=y), band, 0.0)].sum()))
-    if max(collected, default=0.0) <= 0:
+    places, angle, middle, most = np.column_stack([pixels.x, pixels.y]), 0.0, np.zeros(2), 0.0
+    for next_angle, point in tried:
+        x, y = _along_and_side(next_angle) @ (places - point).T
+        if likely[np.abs(y) < band].sum() > most:  # else no front along it collects more
+            collected = float(likely[_on_front(pixels._replace(x=x, y=y), band, 0.0)].sum())
+            most, angle, middle = (collected, next_angle, point) if collected > most else (most, angle, middle)
+    if most <= 0:
         return _NO_LINE
-    (angle, middle), band = tried[int(np.argmax(collected))], first_band
+    band = first_band
     # 3, 20: fewest and most times that a line is refined on the pixels that agree with it (chosen)
     for round_ in range(1, 20 + 1):
         turned = _along_and_side(angle) @ (places - middle).T
@@ -649,15 +651,15 @@ def _on_front(along: Pixels, band: float, slack: float) -> Bools:
 def find_growth_axis(small: SmallPictures) -> Axis:
     """Find the growth axis from the motion: a straight line, or a curve where that explains more in less width."""
     curve = find_curve(small)
-    if curve is None or front_share(small, curve, of_picture=True) < LEAST_FRONT_SHARE:
+    if curve is None or (of_curve := front_share(small, curve, of_picture=True)) < LEAST_FRONT_SHARE:
         return find_axis(small)
     try:
         straight = find_axis(small)
     except RecordingError:
         return curve
-    of_curve, of_line = (front_share(small, axis, of_picture=True) / axis.width_px for axis in (curve, straight))
+    of_line = front_share(small, straight, of_picture=True) / straight.width_px
     # 1.3: least ratio of what curve and line explain in a band of one width (measured)
-    return curve if of_curve > 1.3 * of_line else straight
+    return curve if of_curve / curve.width_px > 1.3 * of_line else straight
 
 
 def find_curve(small: SmallPictures) -> Axis | None:
