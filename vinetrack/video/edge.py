@@ -32,7 +32,16 @@ from vinetrack.video.axis import (
 )
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import Look, Positions, Strip, Tracker, calibrated_sigma, cut_strip, snap_to_grid
+from vinetrack.video.strip import (
+    Look,
+    Positions,
+    Strip,
+    Tracker,
+    calibrated_sigma,
+    cut_strip,
+    median_picture,
+    snap_to_grid,
+)
 
 # ------------------------------------------------------------------------------
 # State of the tracker and the steps of its alternation: estimate film and background, then fit the edge.
@@ -457,7 +466,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     column of those that changed in runs, the one behind the last, and that in the last frame, which may be further on.
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
-    last, first = (_middle_of(list(strip.brightness(frames))) for frames in ends)
+    last, first = (median_picture(strip.brightness(frames)) for frames in ends)
     changed, by_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness(ends[0])[-1]))
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
@@ -477,13 +486,6 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
     passed = int(first_column), int(last_column) + 1, int(max(last_column, by_now[-1])) + 1
     return straight_tip(strip, _with_run_up(np.clip(path, *passed[:2]))), passed
-
-
-def _middle_of(pictures: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Median of an odd number of pictures, sorted by exchanging: numpy sorts the values of each pixel, ten times slower."""
-    for i, j in itertools.combinations(range(len(pictures)), 2):
-        pictures[i], pictures[j] = np.minimum(pictures[i], pictures[j]), np.maximum(pictures[i], pictures[j])
-    return pictures[len(pictures) // 2]
 
 
 def _changed_columns(change: NDArray[np.float32], noise: float) -> Indices:
