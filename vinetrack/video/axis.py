@@ -594,15 +594,15 @@ def _line_through(
     """The line along which most change is collected in order, or an empty one. The best of those `tried` (direction and
     point), by what is `likely` within `band`, is refined until its band, at most `most_band`, no longer widens.
     """
-    places, angle, middle, most = np.column_stack([pixels.x, pixels.y]), 0.0, np.zeros(2), 0.0
-    for next_angle, point in tried:
-        x, y = _along_and_side(next_angle) @ (places - point).T
-        if likely[np.abs(y) < band].sum() > most:  # else no front along it collects more
-            collected = float(likely[_on_front(pixels._replace(x=x, y=y), band, 0.0)].sum())
-            most, angle, middle = (collected, next_angle, point) if collected > most else (most, angle, middle)
-    if most <= 0:
+    places, collected = np.column_stack([pixels.x, pixels.y]), [0.0]
+    for angle, middle in tried:
+        x, y = _along_and_side(angle) @ (places - middle).T
+        may_be_best = likely[np.abs(y) < band].sum() > max(collected)  # of all change within reach
+        of_line = pixels._replace(x=x, y=y)
+        collected.append(float(likely[_on_front(of_line, band, 0.0)].sum()) if may_be_best else 0.0)
+    if max(collected) <= 0:
         return _NO_LINE
-    band = first_band
+    (angle, middle), band = tried[int(np.argmax(collected)) - 1], first_band
     # 3, 20: fewest and most times that a line is refined on the pixels that agree with it (chosen)
     for round_ in range(1, 20 + 1):
         turned = _along_and_side(angle) @ (places - middle).T

@@ -32,16 +32,7 @@ from vinetrack.video.axis import (
 )
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import (
-    Look,
-    Positions,
-    Strip,
-    Tracker,
-    calibrated_sigma,
-    cut_strip,
-    median_picture,
-    snap_to_grid,
-)
+from vinetrack.video.strip import Look, Positions, Strip, Tracker, calibrated_sigma, cut_strip, median_of, snap_to_grid
 
 # ------------------------------------------------------------------------------
 # State of the tracker and the steps of its alternation: estimate film and background, then fit the edge.
@@ -466,7 +457,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     column of those that changed in runs, the one behind the last, and that in the last frame, which may be further on.
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
-    last, first = (median_picture(strip.brightness(frames)) for frames in ends)
+    last, first = (median_of(strip.brightness(frames)) for frames in ends)
     changed, by_now = (_changed_columns(now - first, strip.noise) for now in (last, strip.brightness(ends[0])[-1]))
     # Vote of a pixel: near −1 if it looks as at the end, near 1 if as at the start
     # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
