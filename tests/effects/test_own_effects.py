@@ -171,7 +171,7 @@ def test_a_file_names_describes_and_works_out_its_effect_and_bounds_its_paramete
     assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
     if effect.kind == "measurement":
         read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
-        read_off |= {"film_gain", "averaged_over"}
+        read_off |= {"film_gain", "averaged_over", "trace_pressure"}
         # They turn, and add to, a weight and a mass that are there.
         weight = {"growth_angle": {"tail_force"}, "payload_mass": {"tail_force", "added_mass"}}
         assert set(effect.functions) <= read_off | weight.get(effect.name, set())

@@ -100,7 +100,7 @@ def _untestable(effect: Effect, data: Sequence[FitTrial]) -> Remark:
         return remark("in_measured_pressure")
     if "averaged_over" in effect.functions and not _may_be_averages(data):
         return remark("noise_is_not_averaged")
-    if effect.trace_only and not any(has_trace):
+    if {"trace_time", "trace_pressure"} & set(effect.functions) and not any(has_trace):
         return remark("no_measured_pressure")
     if absent := [column for column in effect.needs if not any(stated(column, trial) for trial in trials)]:
         return remark("column_blank", column=absent[0])

@@ -74,7 +74,8 @@ def evaluate(
     if measured_Pa is not None:
         measured: Any = np.asarray(measured_Pa, dtype=float)
         slope: Any = np.gradient(measured, time) if time.size > 1 else nothing
-        state = hooks.changed("gauge", state._replace(pressure=measured, pressure_slope=slope))
+        state = hooks.changed("trace_pressure", state._replace(pressure=measured, pressure_slope=slope))
+        state = hooks.changed("gauge", state)
     elif hooks.calls.get("chamber_rate"):
         state = state._replace(pressure=_chamber_pressure(hooks, state))
     state = hooks.changed("damping_gain", _with_consistent_area(hooks, state))

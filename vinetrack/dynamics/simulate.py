@@ -104,6 +104,7 @@ def {name}({arguments}):
     set_pressure = pressure
     if measured:
         pressure = trace_at(time, trial)
+        {calls("gauge", "pressure =", 8)}
     {"else: pressure = chamber" if has_chamber else ""}
     {calls("yield_gauge", "yield_pressure =")}
     {losses}
@@ -299,7 +300,7 @@ def lay_out(
         thetas=thetas,
         trace_starts=trace_starts,
         trace_time=trace_time,
-        trace_pressure=_true(*clocks, "gauge", trace_starts, trace_time, read_Pa),
+        trace_pressure=_true(*clocks, "trace_pressure", trace_starts, trace_time, read_Pa),
         bend_starts=starts_of(bends),
         bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
         breakpoints=breakpoints,
@@ -359,8 +360,8 @@ def _true(
     model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], hook: str, starts: NDArray[np.int64],
     time_s: Floats, read_Pa: Floats | None = None,
 ) -> Floats:  # fmt: skip
-    """True times since release of stamps, or true pressures of readings at these times, of all trials, by the effects
-    on the clock or the gauge. Shapes: time_s, read_Pa (n_times,).
+    """True times since release of stamps, or pressures behind readings at these times, of all trials, by the effects on
+    the clock or the trace. Shapes: time_s, read_Pa (n_times,).
     """
     true = (time_s if read_Pa is None else read_Pa).copy()
     for effect, function, place in model.hooks[hook]:

@@ -24,6 +24,7 @@ from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 HOOKS: Mapping[str, str | float] = {
     "true_time": "time",
     "trace_time": "time",
+    "trace_pressure": "pressure",
     "film_gain": 1.0,
     "gauge": "pressure",
     "yield_gauge": "yield_pressure",
@@ -62,7 +63,7 @@ class State(NamedTuple):
     bend_angle: float  #: angle of the bends that the tip has passed, rad
     tail_tension: float  #: T₁, tension of the tail that balances the tip forces, N (for `observed_position` only)
     observed: float  #: position that the camera reports, m, as changed by effects evaluated before
-    pressure_slope: float  #: rate at which a recorded pressure changes, Pa/s, 0 for a set one (for `gauge` only)
+    pressure_slope: float  #: rate at which a recorded pressure changes, Pa/s (for `trace_pressure` only)
 
 
 class TrialInputs(NamedTuple):
@@ -203,9 +204,9 @@ class Effect:
 
     true_time           true time since release of a frame that the camera stamps `s.time`, s
     trace_time          true time since release of a sample that a pressure trace stamps `s.time`, s
+    trace_pressure      pressure where a pressure trace, read at `s.time`, shows `s.pressure`, with this slope, Pa
     film_gain           factor on the film's mass per metre
-    gauge               true gauge pressure where the gauge reads `s.pressure`, Pa; of a recorded one, only `s.time` and
-                        `s.pressure_slope` are known besides
+    gauge               true gauge pressure where the gauge reads `s.pressure`, Pa
     yield_gauge         true yield pressure, Pa
     area                changed cross-section, m²
     chamber_rate        rate of change of the chamber's pressure, Pa/s (the chamber then follows its own equation)
@@ -234,7 +235,6 @@ class Effect:
     worked: tuple[Worked, ...] = ()
     path: Path
     in_trace: bool = False  #: a pressure measured during growth already includes it
-    trace_only: bool = False  #: acts on a pressure measured during growth alone
     replaces: tuple[str, ...] = ()  #: effects that it contains and that are inactive while it is in the model
     order: int = 3  #: place among the effects of one hook
     finite: bool = False  #: small sizes resemble another effect (a later release), so finite ones are tested too

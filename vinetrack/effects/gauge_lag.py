@@ -17,14 +17,15 @@ Source: the first-order response of a sensor; Doebelin (2003), Measurement Syste
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-TRACE_ONLY = True
 PARAMETERS = (
     Parameter("tau", "τ_g", "s", 5e-3, bounds=(0.0, 1.0), plausible=(0.0, 0.05), meaning="time constant of the gauge"),
 )
 
 
-def gauge(s, rig, tau):
+def trace_pressure(s, rig, tau):
     return s.pressure + tau * s.pressure_slope
 
 
-WORKED = (Worked("gauge", 27.75e3, "28 kPa − 5 ms × 50 kPa/s", state={"pressure": 28e3, "pressure_slope": -50e3}),)
+WORKED = (
+    Worked("trace_pressure", 27.75e3, "28 kPa − 5 ms × 50 kPa/s", state={"pressure": 28e3, "pressure_slope": -50e3}),
+)

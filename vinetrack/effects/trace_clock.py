@@ -18,7 +18,6 @@ Source: none; the difference of two clocks that run at the same rate.
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-TRACE_ONLY = True
 PARAMETERS = (
     Parameter("delta", "δ_t", "s", 2e-3, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="offset of the clocks"),
 )
