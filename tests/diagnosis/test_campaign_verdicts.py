@@ -24,8 +24,8 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import misfit_tests, result
 from vinetrack.diagnosis.diagnose import with_lost_frames
 from vinetrack.diagnosis.force_inversion import ForceEstimate
+from vinetrack.diagnosis.hypotheses import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.ladder import align_trials, not_better
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set
 from vinetrack.diagnosis.missing_force import Law, RankedLaw
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE
 from vinetrack.effects import catalogue

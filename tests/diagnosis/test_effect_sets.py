@@ -12,8 +12,8 @@ from scipy.stats import chi2, norm
 import vinetrack as vt
 from vinetrack.core.problems import Remark
 from vinetrack.diagnosis import result, selection
+from vinetrack.diagnosis.hypotheses import LikelihoodRatio, in_sigmas, sizes_of
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
 from vinetrack.diagnosis.selection import Search
 from vinetrack.effects import find_effect
 

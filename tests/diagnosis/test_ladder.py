@@ -12,12 +12,10 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import between_trials, diagnose, result
+from vinetrack.diagnosis import diagnose, hypotheses, result
 from vinetrack.diagnosis import ladder as ladder_module
-from vinetrack.diagnosis.between_trials import Difference, between_fits, confounded, differences, significant
+from vinetrack.diagnosis.hypotheses import Difference, between_fits, confounded, differences, robust_ratio, significant
 from vinetrack.diagnosis.ladder import align_trials, compare, excess, highest_pressures, ladder, left_out_error, rms_of
-from vinetrack.diagnosis.likelihood_ratio import robust_ratio
-from vinetrack.diagnosis.locate import drift, locate, per_trial_estimates
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.experiment.schema import with_names
@@ -156,7 +154,7 @@ def fitted(pairs: Pairs):
 
 def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
     """The higher the pressure, the wider and faster a vine is whose wall gives way."""
-    table = drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"])))).table
+    table = ladder_module.drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"])))).table
     row = table[(table["against"] == "pressure_Pa") & table["vine"].str.startswith("24mm")].iloc[0]
     assert row["significant"]
     assert (row["from_level"], row["to_level"]) == (48e3, 24e3)
@@ -167,7 +165,7 @@ def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
     aligned = align_trials(found)
-    values = per_trial_estimates(found, aligned)
+    values = ladder_module.per_trial_estimates(found, aligned)
     base = aligned.predictor.layout.base[:, found.model.parameter_names.index(B)]
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
@@ -184,10 +182,10 @@ def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_larg
     """In the third campaign the noise remembers itself, in the fourth trials scatter little."""
     nuisances = [{}, {}, {"noise_correlation": 0.6}, {"damping_scatter": 0.005, "pressure_scatter": 0.002}]
     fits = [fitted(pairs_of(grown(sheet(), 72 + k, **more))) for k, more in enumerate(nuisances)]
-    for found in map(drift, fits):
+    for found in map(ladder_module.drift, fits):
         assert found.remarks == ()
         assert found.table["z"].max() < 3
-    z = np.concatenate([locate(fit).along_position["z"] for fit in fits])
+    z = np.concatenate([ladder_module.locate(fit).along_position["z"] for fit in fits])
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.3
     assert np.mean(np.abs(z) > 3) < 0.02
 
@@ -201,7 +199,7 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
         y = track.lead_position_m - track.lead_position_m[:5].mean()
         bump = 8e-3 * np.exp(-0.5 * ((y - 0.14) / 0.03) ** 2) * (trial.condition == chosen)
         bent.append((trial, replace(track, lead_position_m=track.lead_position_m + bump)))
-    found = locate(fitted(bent))
+    found = ladder_module.locate(fitted(bent))
     worst = found.worst.facts
     assert worst["condition"] == {"unit": "kPa", "pressure_Pa": pairs[4][0].pressure_Pa}
     assert worst["off_m"][0] == pytest.approx(7e-3, abs=3e-3)
@@ -211,7 +209,7 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
 
 
 def test_single_trials_are_judged_by_the_scatter_of_the_fit():
-    found = locate(fitted(pairs_of(grown(sheet(replicates=1), 78))))
+    found = ladder_module.locate(fitted(pairs_of(grown(sheet(replicates=1), 78))))
     assert math.isnan(found.worst.facts["floor_m"])
     assert found.along_position["z"].abs().max() < 4
 
@@ -278,8 +276,8 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
 
 @pytest.mark.parametrize("sd", ["B_sd", "pressure_sd_Pa", "gain_sd"])
 def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_deviation(trials, monkeypatch, sd):
-    forms = partial(between_trials.of_column, **{sd: 0.03})
-    monkeypatch.setitem(between_trials.BETWEEN, "day", forms)
+    forms = partial(hypotheses.of_column, **{sd: 0.03})
+    monkeypatch.setitem(hypotheses.BETWEEN, "day", forms)
     known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
     found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9)))
     assert [len(each.terms) for each in found if each.name == "day"] == [1]
@@ -351,7 +349,7 @@ def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(questio
     robust = robust_ratio(plain.fit, (EXPONENT,))
     assert robust_ratio(plain.fit, ("n_by_vine",)) == 1.0  # no number is called that
     assert abs(plain.sigma) == pytest.approx(np.sqrt(abs(plain.delta_chi2)) / robust)
-    monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
+    monkeypatch.setattr("vinetrack.diagnosis.hypotheses.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
     (wider,) = between_fits(questioned, [by_vine], 0.0, str)
     assert abs(wider.sigma) == pytest.approx(np.sqrt(abs(wider.delta_chi2)) / 3)
     assert wider.inflation == pytest.approx(9.0)  # the same for significance, evidence and answer set

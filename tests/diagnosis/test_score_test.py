@@ -12,7 +12,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import likelihood_ratio as ratios
+from vinetrack.diagnosis import hypotheses as ratios
 from vinetrack.diagnosis import misfit_tests, selection
 from vinetrack.diagnosis.misfit_tests import MisfitTests, Scores
 from vinetrack.effects import catalogue
@@ -209,7 +209,7 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     after = known_fit(-100.0, number_of("air_drag.C_D", 1.0, 0.1))
     after.predictor, after.solution = SimpleNamespace(data=(None,) * 12), None
     scattered = (np.diag([0.01]), np.array([0.01 * ratio**2]), np.array([5.0]))
-    monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_variances", lambda *_: scattered)
+    monkeypatch.setattr("vinetrack.diagnosis.hypotheses.robust_variances", lambda *_: scattered)
     found = ratios.likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
     assert found.delta_chi2 == pytest.approx(100.0)
     assert found.sigma == pytest.approx(10.0 / max(ratio, 1.0))

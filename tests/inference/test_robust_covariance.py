@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.locate import against_the_sheet
+from vinetrack.diagnosis.ladder import against_the_sheet
 from vinetrack.inference import errors, fit_result, optimiser
 from vinetrack.inference.optimiser import solve
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA

@@ -19,11 +19,10 @@ from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats, Track, with_flag
 from vinetrack.diagnosis.further_trials import next_experiment
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, not_better, with_host
+from vinetrack.diagnosis.hypotheses import FAR_BEHIND, LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, locate, not_better, with_host
 from vinetrack.diagnosis.ladder import ladder as error_ladder
-from vinetrack.diagnosis.likelihood_ratio import FAR_BEHIND, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.locate import locate
 from vinetrack.diagnosis.misfit_tests import LARGEST_MISSED, testable
 from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.result import (

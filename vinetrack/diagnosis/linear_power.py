@@ -25,8 +25,8 @@ from scipy.special import ndtr, stdtrit
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, plain_track
+from vinetrack.diagnosis.hypotheses import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.ladder import candidates_of
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     PROBE_LEVEL,

@@ -28,7 +28,7 @@ from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Floats
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import FittedMotion, ForceEquations, ForceEstimate, ForcePoint, ForceProblem
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
+from vinetrack.diagnosis.hypotheses import ANSWER_SET_DELTA_CHI2
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,

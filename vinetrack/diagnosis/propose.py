@@ -23,14 +23,14 @@ import pandas as pd
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.process import in_one_blas_thread
 from vinetrack.core.records import Track
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out_error, with_host
-from vinetrack.diagnosis.likelihood_ratio import (
+from vinetrack.diagnosis.hypotheses import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,
 )
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out_error, with_host
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SEARCH_SIGMAS, misfit_tests
 from vinetrack.diagnosis.missing_force import (
     LEAST_MISFIT_REDUCTION,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.core.records import Track, Trial
-    from vinetrack.diagnosis.locate import Failure
+    from vinetrack.diagnosis.ladder import Failure
     from vinetrack.diagnosis.missing_force import MissingForce
     from vinetrack.inference.fit_data import Pairs
 

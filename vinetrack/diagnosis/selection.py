@@ -18,18 +18,20 @@ import numpy as np
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.diagnosis.between_trials import between_fits, differences, significant
-from vinetrack.diagnosis.likelihood_ratio import (
+from vinetrack.diagnosis.hypotheses import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
     LikelihoodRatio,
     answer_set,
     best_of,
+    between_fits,
+    differences,
     full_fit,
     implausible,
     in_sigmas,
     likelihood_ratio,
     robust_ratio,
+    significant,
     size_in_errors,
     sizes_of,
     stand_in,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, with_error
-from vinetrack.diagnosis.between_trials import BETWEEN, ORDER_DRIFT, SPECIMEN
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
+from vinetrack.diagnosis.hypotheses import ANSWER_SET_DELTA_CHI2, BETWEEN, ORDER_DRIFT, SPECIMEN
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -33,7 +32,7 @@ from vinetrack.narrative import sentence
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+    from vinetrack.diagnosis.hypotheses import LikelihoodRatio
     from vinetrack.diagnosis.result import Candidate, Confounder, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 

@@ -34,9 +34,9 @@ from vinetrack.diagnosis.ladder import (
     align_trials,
     candidates_of,
     compare,
+    drift_groups,
     initial_fit,
 )
-from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import propose
 from vinetrack.diagnosis.result import UNEXPLAINED, Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
