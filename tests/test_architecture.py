@@ -26,7 +26,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (637, 2, 2),
     "core": (952, 6, 23),
-    "diagnosis": (5805, 14, 68),
+    "diagnosis": (5739, 12, 67),
     "dynamics": (2171, 7, 17),
     "effects": (565, 3, 7),
     "experiment": (1600, 4, 15),

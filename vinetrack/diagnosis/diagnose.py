@@ -366,10 +366,6 @@ def _most(trials: int) -> int:
     return max(2, int(0.125 * trials))  # 0.125: the largest fraction (chosen)
 
 
-# ------------------------------------------------------------------------------
-# Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict.
-
-
 def with_lost_frames(result: Diagnosis, lost: Mapping[str, bool]) -> Diagnosis:
     """Put certain dropped frames first in a diagnosis, and its verdict with corrected times into a note. A jump that a
     few outlying points may have caused becomes a note only.

@@ -427,11 +427,6 @@ class ForceEquations:
         fall, dof = float(score @ change), float(np.trace(covariance @ information))
         return ForceEstimate(fall, change, math.sqrt(variance * self.problem.inflation(self.chi2 - fall)), dof)
 
-    def chi2_with(self, coefficients: Floats) -> float:
-        """χ² with these coefficients, all other unknowns estimated anew."""
-        change = coefficients - self.coefficients
-        return self.chi2 - 2 * float(self.score @ change) + float(change @ self.information @ change)
-
     def moved(self, coefficients: Floats) -> ForcePoint:
         """The point with other coefficients, to first order: a Gauss–Newton step of all unknowns and motions together
         (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010). Releases move by at most two frames, and

@@ -225,10 +225,6 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     return members, rejected
 
 
-# ------------------------------------------------------------------------------
-# Fits of hypotheses.
-
-
 def stand_in(name: str, kind: str = "physical", parameters: tuple[Parameter, ...] = ()) -> Effect:
     """What stands for a hypothesis that is no effect in tables of candidates and answer sets."""
     return Effect(name=name, kind=kind, summary=name, text=name, parameters=parameters, functions={}, path=Path(name))

@@ -436,9 +436,6 @@ def _final_speed_errors(
     return errors
 
 
-# ------------------------------------------------------------------------------
-# The errors of every model of the ladder.
-
 LADDER_COLUMNS = (
     *("model", "added", "rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m"),
     *(*EXPECTED, "partial"),
@@ -586,9 +583,7 @@ def _worst_condition(aligned: AlignedTrials, along: pd.DataFrame) -> Remark:
 
 
 def _residual_along_growth(aligned: AlignedTrials) -> pd.DataFrame:
-    """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it, with
-    its standard error.
-    """
+    """Mean residual of each condition in every stretch of the growth of its vine, over the trials that reach it."""
     multiple, rows = aligned.scatter.multiple, list[tuple[object, ...]]()
     every = list(itertools.chain(*aligned.courses.values()))
     for condition, members in aligned.courses.items():
@@ -691,11 +686,6 @@ def _tested(
     row = subject | dict(zip(DRIFT_COLUMNS[4:], (*levels, *change, -float(ndtri(max(p, 1e-300) / 2))), strict=False))
     sentence = remark("drifts", row=row, pressure_unit=number.pressure_unit, **told)
     return row | {"sentence": sentence, "p": p, "groups": [subject | group for group in groups]}
-
-
-# ------------------------------------------------------------------------------
-# B of each trial, with all other parameters at their common values, and tests of whether it changes with a condition: a
-# linear trend.
 
 
 def per_trial_estimates(fit: Fit, aligned: AlignedTrials) -> pd.DataFrame:

@@ -314,7 +314,7 @@ def error_inflation(tests: MisfitTests) -> Floats:
 
 def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Floats) -> dict[str, float]:
     """How often each other candidate scores highest at a size, whose scores have this mean, among draws in which any
-    candidate exceeds its threshold. A score counts where its size is credible, see `likelihood_ratio`; an effect that
+    candidate exceeds its threshold. A score counts where its size is credible, see `hypotheses`; an effect that
     contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
     """
     drawn, effects = null_scores + mean, np.array(tests.products.effects)
@@ -424,9 +424,7 @@ Outcome = tuple[str, bool] | None
 
 
 def simulated_diagnosis(tests: MisfitTests, effect: str, values: Sequence[float], seed: int) -> Outcome:
-    """Simulate one campaign like that of the tests, with an effect of these values unless it is blank, and diagnose it
-    in full.
-    """
+    """Simulate one campaign like that of the tests, see `filmed_again`, and diagnose it in full."""
     from vinetrack.diagnosis.diagnose import diagnose
 
     model, candidates = tests.fit.model, [candidate.name for candidate in tests.effects]

@@ -318,8 +318,11 @@ def learned_force(problem: ForceProblem, first: Sequence[Choice], choices: Seque
     unit = max(LEAST_DIFFERENCE * _least_chi2(choices) / inflation, 1.0)
     weights = variable_weights({choice.domain.name: choice.found.log_evidence for choice in choices}, unit)
     best = max(choices, key=lambda choice: weights[choice.domain.name])
-    domain, equations, mean = best.domain, best.equations, best.found.mean
-    explained = (misfit + problem.n_points - equations.chi2_with(mean)) / misfit
+    domain, equations = best.domain, best.equations
+    change = best.found.mean - equations.coefficients
+    # With these coefficients, all other unknowns estimated anew
+    chi2 = equations.chi2 - 2 * float(equations.score @ change) + float(change @ equations.information @ change)
+    explained = (misfit + problem.n_points - chi2) / misfit
     # 0.95: part of the misfit that the force must take away to be reported (chosen)
     if explained < 0.95:
         return None
@@ -445,12 +448,6 @@ class RankedLaw:
         """Description of the law with its amplitude."""
         return str(remark("law", symbols=self.law.symbols, size=(self.amplitude_N, self.estimate.sigma)))
 
-    @property
-    def row(self) -> dict[str, Any]:
-        """As a row of `laws` in `diagnosis.json`."""
-        of_law = {"law": self.law.name, "words": self.words, "explained": self.explained}
-        return of_law | {"amplitude_N": self.amplitude_N, "sigma_N": self.estimate.sigma}
-
 
 def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:
     """All laws: detected ones first, then by their Bayesian information criterion (Schwarz, Annals of Statistics 6,
@@ -477,9 +474,6 @@ def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_de
     return sorted(ranked, key=lambda law: (not law.is_detected, law.bic))
 
 
-# ------------------------------------------------------------------------------
-# What is missing.
-
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
 # Part of the misfit that a smooth force in every condition must take away for the misfit to count as a force (chosen)
@@ -494,16 +488,15 @@ class MissingForce:
     sentence: Remark
     learned: LearnedForce | None = None
 
-    @property
-    def detected(self) -> list[RankedLaw]:
-        """The laws that differ from zero."""
-        return [law for law in self.laws if law.is_detected]
-
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
             "sentence": str(self.sentence),
-            "laws": [law.row for law in self.laws[:6]],
+            "laws": [
+                {"law": one.law.name, "words": one.words, "explained": one.explained}
+                | {"amplitude_N": one.amplitude_N, "sigma_N": one.estimate.sigma}
+                for one in self.laws[:6]
+            ],
             "learned": None if self.learned is None else self.learned.to_json(),
         }
 

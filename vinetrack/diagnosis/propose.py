@@ -101,11 +101,8 @@ _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "
 
 
 def table_text(learned: LearnedForce, origin: str = "") -> str:
-    """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
-    worked example.
-    """
-    domain = learned.domain
-    visited = learned.visited
+    """Source of an effect file that holds a learned force."""
+    domain, visited = learned.domain, learned.visited
     largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
     at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in domain.variables}
     worked_N = float(learned.force([np.array([value]) for value in at.values()])[0][0])
@@ -227,7 +224,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     before = initial_fit(model, pairs, candidates_of(model, None, {}))
     report("estimating the missing force")
     force = missing_force(before)
-    detected = force.detected
+    detected = [law for law in force.laws if law.is_detected]
     # 0.2: laws that explain less than the best by more than this part are not fitted (chosen)
     # 4: most laws that are fitted in the equation of motion (chosen)
     best = [law for law in detected if law.explained > detected[0].explained - 0.2][:4]
@@ -296,17 +293,12 @@ def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
     return ratio.sigma > SEARCH_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
 
 
-# ------------------------------------------------------------------------------
-# A law as an effect file.
-
 # State of the worked example; a convention of this file
 _WORKED_STATE = {"tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
 
 
 def effect_text(detected: RankedLaw, origin: str = "") -> str:
-    """Source of an effect file that holds a law: docstring, parameter with unit and bounds, function, worked
-    example.
-    """
+    """Source of an effect file that holds a law."""
     law, size = detected.law, float(f"{detected.amplitude_N / detected.law.peak:.6g}")
     unit = "·".join(f"{of.unit}{('', '²', '³')[power - 1]}" for of, power in law.factors)
     names, limits = ("k", "k", f"N/({unit})" if unit else "N"), ((-100 * abs(size), 100 * abs(size)), (0.0, 10 * size))

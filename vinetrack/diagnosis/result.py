@@ -219,10 +219,6 @@ class Power(Drawn, JsonRecord):
         return in_words(self)
 
 
-# ------------------------------------------------------------------------------
-# Record of an undetected effect that a fitted size may include, as stored in a diagnosis and its file.
-
-
 @dataclass(frozen=True)
 class Confounder(JsonRecord):
     """Another effect that a fitted size, of this `parameter` and vine, may include: with any size of it that is not
