@@ -64,17 +64,15 @@ class BodyTracker(Tracker):
         # Cut near the middle of the frames in which the whole body is inside and moving
         whole = np.flatnonzero((path > 1.3 * half) & (path < pictures.shape[2] - 1 - 1.3 * half))
         moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
-        chosen = np.array(moving or whole.tolist() or [*range(len(path))])
-        template_frame = chosen[len(chosen) // 2]
+        chosen = moving or whole.tolist() or [*range(len(path))]
+        template_frame = int(chosen[len(chosen) // 2])
         template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
         mask = np.broadcast_to(_near(len(template), strip.axis.width_px), template.shape).astype(np.uint8)
-        place = _searched(pictures, template, path)
-        # 60: frames of whose patches the median is taken; 3: times that it replaces the template (chosen)
-        some = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), 60)).astype(int))]
+        place, error, match = _registered(pictures, template, mask, _searched(pictures, template, path))
+        # 3: times that the template is replaced by the median of the patches found (chosen)
         for _ in range(3):
-            place[some], _, match = _registered(pictures[some], template, mask, place[some])
-            template = _median_template(pictures[some], place[some], match, half)
-        place, error, match = _registered(pictures, template, mask, place)
+            template = _median_template(pictures, place, match, half)
+            place, error, match = _registered(pictures, template, mask, place)
         inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
         off_axis = np.abs(place[:, 1]) > 0.75 * SEARCH_ACROSS_PX
         unseen, end = (match < LEAST_MATCH) | off_axis, None
@@ -120,8 +118,7 @@ def _coarse_path(pictures: NDArray[np.float32], noise: float, near: Bools) -> tu
     over frames spread evenly over the changes, so that a body that rests for long does not become part of it.
     """
     background = np.median(busy_frames(pictures, 41), axis=0)
-    of_frames = (near * np.clip(np.abs(picture - background) - 3 * noise, 0, 60) for picture in pictures)
-    foreground = np.stack([picture.sum(axis=0) for picture in of_frames])
+    foreground = (near * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
     # Half the length of what differs from the background, from the width of its autocorrelation along the axis
     clearest = foreground[np.argsort(foreground.sum(axis=1))[len(pictures) // 2 :]]
     clearest = clearest - clearest.mean(axis=1, keepdims=True)
@@ -189,6 +186,7 @@ def _median_template(pictures: NDArray[np.float32], place: Floats, match: Floats
     good = np.flatnonzero(whole & (match >= LEAST_MATCH))
     if len(good) < 3:
         good = np.argsort(match)[-3:]
+    good = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), 60)).astype(int))]
     stack = np.stack([_patch(pictures[t], place[t, 0], place[t, 1], half) for t in good])
     stack -= stack.mean(axis=(1, 2), keepdims=True)
     return np.median(stack / stack.std(axis=(1, 2), keepdims=True), axis=0).astype(np.float32)
