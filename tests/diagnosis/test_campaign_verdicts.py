@@ -328,7 +328,7 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
 
 
 def test_trials_that_only_the_initial_model_misses_by_far_are_no_reason_to_look_at_their_rows(depleted, monkeypatch):
-    missed = [np.sort(relative_residuals(fit.predictor, fit.solution))[-2:] for fit in depleted.fits]
+    missed = [np.sort(relative_residuals(fit.solution))[-2:] for fit in depleted.fits]
     fit = replace(depleted.fits[0], left_out={"still": "it stands"})
     for largest, told in zip(missed, (False, True), strict=True):
         monkeypatch.setattr("vinetrack.diagnosis.diagnose.LARGEST_MISSED", largest.mean())

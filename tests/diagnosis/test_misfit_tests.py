@@ -61,8 +61,8 @@ def seen_crookedly() -> Pairs:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
-    def none(predictor, solution) -> systematics.Systematics:
-        return systematics.systematics_of(predictor, solution, ())
+    def none(solution) -> systematics.Systematics:
+        return systematics.systematics_of(solution, ())
 
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model
@@ -210,7 +210,7 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again():
     """Of trials whose tail rubs. Of many trials a search lets go of curves."""
     fit = vt.fit(vt.base_model(), hidden({"tail_friction.mu_w": 1.0}, seed=7270))
     light = selection.without_curves(fit)
-    of_light, of_fit = (relative_residuals(one.predictor, one.solution) for one in (light, fit))
+    of_light, of_fit = (relative_residuals(one.solution) for one in (light, fit))
     again = selection.with_curves(light)
     assert (of_light.tolist(), light.trials) == (of_fit.tolist(), ())
     assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)

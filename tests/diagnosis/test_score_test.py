@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -132,8 +133,9 @@ def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, resi
     """Of 100 mm of growth. Nothing is then sought beyond a model that passes: 14 s instead of 71 for 24 films."""
     trial = SimpleNamespace(condition="all")
     track = SimpleNamespace(position_systematic_m=systematic_m, lead_position_m=np.array([0.0, 0.1]), trial=trial)
-    solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3)
-    fit = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
+    predictor = SimpleNamespace(data=[track] * 3)
+    solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3, predictor=predictor)
+    fit = SimpleNamespace(chi2_per_dof=chi2, predictor=predictor, solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
@@ -143,8 +145,9 @@ def test_a_condition_that_is_missed_in_every_replicate_is_far_off_though_most_tr
     trials, grown_m = [SimpleNamespace(condition=name) for name in names], np.array([0.0, 0.1])
     data = [SimpleNamespace(position_systematic_m=0.0, lead_position_m=grown_m, trial=trial) for trial in trials]
     columns = [np.full((4, 1), 2e-3 if far else 1e-6) for far in missed[:7]]
-    solution = SimpleNamespace(columns=columns)
-    fit = SimpleNamespace(chi2_per_dof=900.0, predictor=SimpleNamespace(data=data), solution=solution)
+    predictor = SimpleNamespace(data=data)
+    solution = SimpleNamespace(columns=columns, predictor=predictor)
+    fit = SimpleNamespace(chi2_per_dof=900.0, predictor=predictor, solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == (replicates_missed == 2)
 
 
@@ -166,19 +169,20 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
 
 def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
-    columns = np.random.default_rng(20609).standard_normal((12, 40, 6))  # two errors, the residual, three shapes
+    columns = np.random.default_rng(20609).standard_normal((12, 40, 6))  # two errors, three shapes, the residual
     blocks = np.swapaxes(columns, 1, 2) @ columns
     places = np.tile([0, 1], (12, 1))
     arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
     problem = SimpleNamespace(index=places, **arrays)
+    problem.summed = partial(marginal_likelihood.MixedProblem.summed, problem)
     products = SimpleNamespace(problem=problem, n_unknowns=2, without_trial_effects=lambda _: blocks)
     state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
     found = misfit_tests.scores_of(SimpleNamespace(numbers=(), trials=()), products, state)
     total = blocks.sum(axis=0)
-    A, B, C, inner = total[3:, 3:], total[3:, :2], total[:2, :2], np.linalg.inv(total[:2, :2] + np.eye(2))
+    A, B, C, inner = total[2:5, 2:5], total[2:5, :2], total[:2, :2], np.linalg.inv(total[:2, :2] + np.eye(2))
     assert np.linalg.eigvalsh(C).min() > 1
     assert found.information == pytest.approx(A - B @ inner @ B.T)
-    assert found.score == pytest.approx(total[3:, 2] - B @ inner @ total[:2, 2])
+    assert found.score == pytest.approx(total[2:5, 5] - B @ inner @ total[:2, 5])
     assert found.fitted == 0
 
 

@@ -23,7 +23,7 @@ from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import not_measured, prepare
 from vinetrack.inference.gaussian_processes import products
 from vinetrack.inference.marginal_likelihood import FitState
-from vinetrack.inference.optimiser import FixedTerms, solve, trial_costs
+from vinetrack.inference.optimiser import FixedTerms, Solution, solve, trial_costs
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.interface import ERROR_COLUMNS
@@ -334,8 +334,8 @@ def test_a_step_that_is_short_by_its_damping_alone_is_no_convergence(campaign, m
     solution, predictor = campaign[0].solution, campaign[0].predictor
     target = solution.state.theta
 
-    def damped(*given: Any) -> tuple[FitState, float]:
-        return replace(given[3], theta=given[3].theta + 0.05 * (target - given[3].theta)), 1e9
+    def damped(at: Solution, *_: Any) -> tuple[FitState, float]:
+        return at.with_state(theta=at.state.theta + 0.05 * (target - at.state.theta)).state, 1e9
 
     monkeypatch.setattr(optimiser, "_accepted_step", damped)
     held = FixedTerms(solution.state.spread, (solution.state.rho, solution.state.variance))

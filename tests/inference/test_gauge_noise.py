@@ -290,7 +290,7 @@ def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, lab
 
 def test_an_error_of_a_trace_is_estimated(fit):
     """A trace bent by two of its standard deviations, in the trial that its bend moves most, is bent back."""
-    shapes = systematics_of(fit.predictor, fit.solution, ["gauge"])
+    shapes = systematics_of(fit.solution, ["gauge"])
     assert not shapes.sources
     moves_m = [np.max(np.abs(columns[:, 1])) for columns in shapes.own]
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
@@ -299,7 +299,7 @@ def test_an_error_of_a_trace_is_estimated(fit):
     data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 1]))
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
     solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
-    after, place = with_systematics(moved, solution).solution.state, (which, N_TRIAL_EFFECTS + 1)
+    after, place = with_systematics(solution).solution.state, (which, N_TRIAL_EFFECTS + 1)
     assert after.trial_effects[place] - fit.with_errors.trial_effects[place] == pytest.approx(-2.0, abs=0.5)
 
 

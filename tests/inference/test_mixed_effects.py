@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.errors import precision
 from vinetrack.inference.gaussian_processes import at_correlation, products, whiten
-from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.marginal_likelihood import Linearised
 
 RHO, SIGMA = 0.45, 0.3
 
@@ -30,6 +30,7 @@ def given(n_trials: int, count: int, keys: int, spread=1e-5, *, rho=RHO, sigma=S
         "points": np.full(n_trials, float(count)),
         "stretches": np.ones(n_trials),
         "release_reach_s": np.full(n_trials, np.inf),
+        "least_variance": np.zeros(n_trials),
     }
     own |= {"release_origin_precision": np.full((n_trials, 2), 1e-6)}
     shared = {name: np.zeros(keys) for name in ("prior_mean", "prior_precision")} | {"free": np.ones(keys, bool)}
@@ -69,8 +70,7 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     effects = np.tile([moved, -moved, 0.0, 0.0], (n_trials, 1))
     frame, state = given(n_trials, count, keys, spread, release_origin_precision=np.full((n_trials, 2), flat_sd**-2))
     state = replace(state, trial_effects=effects)
-    part = marginal.marginal(crossed(columns), frame, state)
-    found = marginal.deviances(part, frame, state, np.array([state.spread]), restricted=False)
+    found = Linearised(frame, state, crossed(columns)).deviances(np.array([state.spread]), restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
     for c in columns:
@@ -92,7 +92,7 @@ def test_residuals_at_zero_deviations_are_restored():
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(crossed(columns), RHO)
-    restored = marginal.at_prior_means(white, frame, state, -1)
+    restored = marginal.at_prior_means(white, frame, state)
     assert restored == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
@@ -125,10 +125,9 @@ def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
 def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = given(4, 20, 2, 0.5)
-    part = marginal.marginal(crossed(columns), frame, state)
-    spreads = np.array([state.spread])
-    restricted, plain = (marginal.deviances(part, frame, state, spreads, restricted=how)[0] for how in (True, False))
-    known = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
+    at, spreads = Linearised(frame, state, crossed(columns)), np.array([state.spread])
+    restricted, plain = (at.deviances(spreads, restricted=how)[0] for how in (True, False))
+    known = precision(at)
     assert restricted - plain == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
 
 
@@ -139,11 +138,10 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance_wi
     own = np.tile([0.0, 0.0, 0.0, 1.0, 1.0], (count, 1))
     columns = [np.column_stack([own, level + 0.01 * draw.standard_normal(count)]) for level in levels]
     means = np.array([c[:, -1].mean() for c in columns])
-    cross_products = crossed(columns)
     frame, state = given(n_trials, count, 1, 0.3, rho=0.0, sigma=0.01)
-    part = marginal.marginal(cross_products, frame, state)
-    found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))
-    solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
+    at = Linearised(frame, state, crossed(columns), estimable=(False, True))
+    found = at.likeliest_spread()
+    solution = at.with_state(spread=found)
     assert found[1] == pytest.approx(math.sqrt(means.var(ddof=2) - 0.01**2 / 25), rel=2e-3)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=2) / math.sqrt(12), rel=2e-3)
 
@@ -154,9 +152,9 @@ def test_a_standard_deviation_between_trials_that_looks_like_none_is_within_its_
     own = np.tile([0.0, 0.0, 0.0, 1.0, 1.0], (count, 1))
     columns = [np.column_stack([own, 2.0 + 0.01 * draw.standard_normal(count)]) for _ in range(n_trials)]
     frame, state = given(n_trials, count, 1, 0.3, rho=0.0, sigma=0.01)
-    part = marginal.marginal(crossed(columns), frame, state)
-    found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))[1]
-    at_it, at_none = marginal.deviances(part, frame, state, np.array([[1e-5, found], [1e-5, 1e-5]]))
+    at = Linearised(frame, state, crossed(columns), estimable=(False, True))
+    found = at.likeliest_spread()[1]
+    at_it, at_none = at.deviances(np.array([[1e-5, found], [1e-5, 1e-5]]))
     assert 0.2 < at_it - at_none < 1
     assert found > 1e-4
 
@@ -173,8 +171,7 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start):
         columns.append(np.column_stack([own, slope, seen]))
     frame, state = given(n_trials, count, 1, rho=0.0, sigma=1e-4, has_deviation=np.ones((n_trials, 2), bool))
     state = replace(state, spread=start)
-    part = marginal.marginal(crossed(columns), frame, state)
-    pressure, damping = marginal.estimate_between_trial_sd(part, frame, state, (True, True))
+    pressure, damping = Linearised(frame, state, crossed(columns), estimable=(True, True)).likeliest_spread()
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
 
@@ -187,9 +184,8 @@ def test_noise_is_estimated_without_the_bias_of_fitted_parameters():
         noise = np.linalg.cholesky(covariance(count, rho, 1.0)) @ draw.standard_normal(count)
         noise -= flat @ np.linalg.lstsq(flat, noise, rcond=None)[0]
         columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
-    cross_products = crossed(columns)
     frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
-    found, variance = marginal.estimate_noise(cross_products, frame, state)
+    found, variance = Linearised(frame, state, crossed(columns)).likeliest_noise()
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
     assert found == pytest.approx(rho, abs=0.03)
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
@@ -201,7 +197,7 @@ def test_a_noise_correlation_near_the_largest_is_found_between_grid_points():
     columns = [np.column_stack([np.zeros((count, 4)), root @ draw.standard_normal(count)]) for _ in range(n_trials)]
     frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
     # 20 000 points: ρ to 0.002
-    assert marginal.estimate_noise(crossed(columns), frame, state)[0] == pytest.approx(rho, abs=0.006)
+    assert Linearised(frame, state, crossed(columns)).likeliest_noise()[0] == pytest.approx(rho, abs=0.006)
 
 
 @pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
@@ -211,9 +207,8 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
     n_trials, count = 40, 12
     sd = np.where(np.arange(n_trials) % 2, louder, 1.0)
     columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
-    cross_products = crossed(columns)
     frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
-    _, variance = marginal.estimate_noise(cross_products, frame, state, rho=0.0)
+    _, variance = Linearised(frame, state, crossed(columns)).likeliest_noise(rho=0.0)
     alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
     assert lowest < np.std(np.log(variance)) / np.std(np.log(alone)) < highest
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
@@ -222,7 +217,7 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
 def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge():
     frame, _ = given(3, 25, 1, gauge_error=np.array([0.0, 4e-3, 0.0]))
     expected = [[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]]
-    assert marginal.trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(np.array(expected))
+    assert frame.deviation_sd((0.01, 0.03)) == pytest.approx(np.array(expected))
 
 
 def test_collinear_parameters_are_detected_and_the_later_one_is_left_where_it_is():
@@ -230,7 +225,7 @@ def test_collinear_parameters_are_detected_and_the_later_one_is_left_where_it_is
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
     frame, state = given(4, 25, 3, 0.1)
-    found = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
+    found = precision(Linearised(frame, state, crossed(columns)))
     assert found.collinear.tolist() == [False, True, True]
     assert np.isinf(found.covariance[1, 1])
     assert np.isfinite(found.covariance[0, 0])
@@ -266,7 +261,7 @@ def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping, bo
     for each in columns:
         each[:, -1] += each[:, 5]
     frame, state = given(4, 20, 2, 0.5, lower=np.full(2, -bound), upper=np.full(2, bound))
-    step, own, predicted = marginal.levenberg_marquardt_step(crossed(columns), frame, state, damping)
+    step, own, predicted = Linearised(frame, state, crossed(columns)).step(damping)
 
     def cost(theta: np.ndarray, effects: np.ndarray) -> float:
         left = [c[:, -1] - c[:, 4:6] @ theta - c[:, :4] @ u for c, u in zip(columns, effects, strict=True)]

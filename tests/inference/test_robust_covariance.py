@@ -68,11 +68,11 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
 def test_no_error_is_smaller_than_the_scatter_of_trials_implies():
     """Of bent pictures the trials scatter 1.6 times as widely in one number as the noise says."""
     found = vt.fit(vt.base_model(), unlike(20620))
-    covariance, robust, _ = errors.robust_variances(found.predictor, found.solution)
+    covariance, robust, _ = errors.robust_variances(found.solution)
     plain = np.diag(covariance)
     assert np.max(robust / plain) > 1.5
     known = errors.precision(found.solution)
-    stated = np.diag(errors.widened_covariance(found.predictor, found.solution, known, ()).covariance)
+    stated = np.diag(errors.widened_covariance(found.solution, known, ()).covariance)
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
 
 
@@ -121,10 +121,10 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
     found = vt.fit(vt.base_model(), bent(pairs, bends_m))
-    alone = errors.robust_variances(found.predictor, found.solution)[1]
+    alone = errors.robust_variances(found.solution)[1]
     told = enumerate(found.predictor.data)
     found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
-    by_day = errors.robust_variances(found.predictor, found.solution)[1]
+    by_day = errors.robust_variances(found.solution)[1]
     assert np.all(by_day >= alone)
     assert np.max(by_day / alone) > 1.2
 
@@ -154,7 +154,7 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"])
     B = found["B"]
-    assert errors.robust_variances(found.predictor, found.solution)[2][0] == pytest.approx(trials - 1, rel=0.05)
+    assert errors.robust_variances(found.solution)[2][0] == pytest.approx(trials - 1, rel=0.05)
     # The spread's prior, itself, takes one degree of freedom more.
     standard_error = float(np.std(np.log(factors), ddof=2)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)

@@ -130,7 +130,7 @@ def _far_off(fit: Fit) -> dict[str, float]:
     or far more than by their noise and than it misses the others. None where half are missed, or two of a condition:
     that is physics.
     """
-    missed, data = relative_residuals(fit.predictor, fit.solution), fit.predictor.data
+    missed, data = relative_residuals(fit.solution), fit.predictor.data
     noises = [trial_data.noise_m / max(float(np.ptp(trial_data.lead_position_m)), 1e-9) for trial_data in data]
     # 5, 3, 0.01: times the median of all trials, times its own noise, and part of its growth, from which a trial is far
     # off (chosen)

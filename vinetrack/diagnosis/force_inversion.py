@@ -31,17 +31,8 @@ from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, products, root_of_covariance, splines
-from vinetrack.inference.marginal_likelihood import (
-    DEVIATION_COLUMNS,
-    FitState,
-    at_prior_means,
-    eliminated,
-    inverse_of_block,
-    summed,
-    trial_effect_prior,
-    whitened_products,
-)
-from vinetrack.inference.optimiser import TYPICAL_SPREADS, track_correlation, variance_floor
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, FitState, Linearised, inverse_of_block
+from vinetrack.inference.optimiser import TYPICAL_SPREADS, track_correlation
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
 from vinetrack.inference.systematics import with_unknowns
 
@@ -327,7 +318,7 @@ class ForceProblem:
         spread = (multiple * TYPICAL_SPREADS[0], multiple * TYPICAL_SPREADS[1])
         effects = np.zeros((len(self.data), N_TRIAL_EFFECTS))
         effects[:, [RELEASE, ORIGIN]] = self.prior.release_origin_mean
-        variance = np.maximum(noise, variance_floor(self.data))
+        variance = np.maximum(noise, self.prior.least_variance)
         self.state = FitState(fit.solution.state.theta, effects, spread, rho, variance)
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
         self.n_independent = 20 * len(self.data)  # Independent residuals where a model leaves more than noise (chosen)
@@ -389,9 +380,8 @@ class ForceEquations:
         cross_products = np.stack([self._products(*of_trial) for of_trial in enumerate(sensitivities)])
         self.joint, theta = with_unknowns(problem.prior, q, 0.0), np.append(point.theta, np.zeros(q))
         state = replace(problem.state, theta=theta, trial_effects=point.trial_effects)
-        white = at_prior_means(whitened_products(cross_products, state), self.joint, state, -1)
-        blocks, self.of_effects = eliminated(white, trial_effect_prior(self.joint, state)[1])
-        square, slope, self.cost = summed(blocks, self.joint, theta)
+        blocks, self.of_effects = Linearised(self.joint, state, cross_products).without_effects()
+        square, slope, self.cost = self.joint.summed(blocks, theta)
         own = np.diag(square)
         self.ridge = LEAST_INFORMATION * np.maximum(own[p:], max(1e-6 * own[p:].max(), 1e-300))
         total = np.column_stack([square, slope])

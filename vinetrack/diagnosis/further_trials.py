@@ -73,9 +73,9 @@ class Designs:
         problem, self.n_unknowns = products.problem, products.problem.prior_mean.size
         size = self.n_unknowns + len(wanted)
         blocks = products.without_trial_effects(fit.state)
-        residual_and_shapes = np.full(blocks.shape[-1] - products.n_unknowns, -1)
-        residual_and_shapes[1 + np.array(wanted)] = np.arange(self.n_unknowns, size)
-        index = np.hstack([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))])
+        shapes_and_residual = np.full(blocks.shape[-1] - products.n_unknowns, -1)
+        shapes_and_residual[np.array(wanted)] = np.arange(self.n_unknowns, size)
+        index = np.hstack([problem.index, np.tile(shapes_and_residual, (len(fit.trials), 1))])
         of_trials = at_unknowns(blocks, index, size)
         # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
         # (chosen); what is asked about has none
@@ -196,7 +196,7 @@ def _designs_of(tied: Sequence[Fit], extended: Sequence[Fit]) -> list[Designs]:
         for i, of_fit in enumerate(fit.solution.columns):
             further = float(i >= count)
             moved = [further * (of_fit[:, -1] - other.solution.columns[i][:, -1]) for other in extended]
-            white.append(in_noise(fit, i, np.column_stack([of_fit, *moved])))
+            white.append(in_noise(fit, i, np.column_stack([of_fit[:, :-1], *moved, of_fit[:, -1]])))
         designs.append(Designs(fit, Products(np.stack(white), fit.solution.problem), count, range(len(tied))))
     return designs
 
@@ -349,7 +349,7 @@ def _refitted(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> float:
         solution = solve(predictor, problem, state, fixed, most_iterations=most, least_decrease=10.0)
         solution = solve(predictor, problem, solution.state, most_iterations=most)
         # These absorb part of what is wrong in a hypothesis, as in every fit.
-        gain = with_systematics(predictor, solution).gain
+        gain = with_systematics(solution).gain
     except SimulationError:
         return math.nan
     return -2 * (solution.log_likelihood() + gain)

@@ -31,7 +31,6 @@ from vinetrack.inference.errors import FEWEST_CLUSTERS, robust_variances, with_s
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number, groups_of
-from vinetrack.inference.marginal_likelihood import deviances, estimate_between_trial_sd, marginal
 from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
 from vinetrack.inference.systematics import with_unknowns
@@ -187,7 +186,7 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     """
     if not names or len(after.predictor.data) < FEWEST_CLUSTERS:
         return 1.0
-    plain, variance, _ = robust_variances(after.predictor, after.solution)
+    plain, variance, _ = robust_variances(after.solution)
     ratios = [
         float(variance[k] / plain[k, k])
         for k, number in enumerate(after.numbers)
@@ -240,7 +239,7 @@ def full_fit(before: Fit, model: Model | None = None, *, best: float = -math.inf
     try:
         # 14, 40: iterations of a full fit at first, and of one that is near then (chosen)
         fit = refit(before, model, most_iterations=14, least=best - FAR_BEHIND, **how)
-        if fit.converged or fit.iterations < 14 or is_poor_fit(fit.predictor, fit.solution):
+        if fit.converged or fit.iterations < 14 or is_poor_fit(fit.solution):
             return fit
         return refit(fit, most_iterations=40, least=best - FAR_BEHIND)
     except (FitError, SimulationError, np.linalg.LinAlgError):
@@ -437,12 +436,12 @@ def differences(fit: Fit) -> list[Difference]:
     """Hypotheses that trials differ, each in its best form, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
         return []
-    base, best = with_systematics(fit.predictor, fit.solution).solution, list[Difference]()
+    base, best = with_systematics(fit.solution).solution, list[Difference]()
     for name, forms_of in BETWEEN.items():
         forms, estimated = forms_of(name, fit, base), list[Difference]()
         for form in forms:
             widened = _widened(fit, base, form)
-            gain = _deviance(base, base) - _deviance(widened, base)
+            gain = 2 * (widened.log_likelihood() - base.log_likelihood())
             if math.isfinite(gain):
                 p = _p_value(fit, form, gain, widened.problem.prior_mean.size - base.problem.prior_mean.size)
                 n_forms = form.n_forms * len(forms)
@@ -469,18 +468,8 @@ def _p_value(fit: Fit, difference: Difference, gain: float, extra: int) -> float
 
 def _likeliest(fit: Fit, base: Solution, forms: Iterable[Difference]) -> Difference:
     """The form that gains most at the between-trial standard deviations of the solution."""
-    return min(forms, key=lambda form: _deviance(_widened(fit, base, form), base, base.state.spread))
-
-
-def _deviance(solution: Solution, base: Solution, spread: tuple[float, float] | None = None) -> float:
-    """−2 ln L, minimised over the parameters and, unless given, the between-trial standard deviations that `base`
-    estimates.
-    """
-    problem, state = solution.problem, solution.state
-    part = marginal(solution.cross_products, problem, state)
-    if spread is None:
-        spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
-    return float(deviances(part, problem, state, np.array([spread]), restricted=False)[0])
+    spreads = np.array([base.state.spread])
+    return min(forms, key=lambda form: float(_widened(fit, base, form).deviances(spreads, restricted=False)[0]))
 
 
 def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
@@ -519,7 +508,7 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
         T[:, column, size - 1 + k] = np.where(problem.index[:, base.problem.index.shape[1] + k] >= 0, factor, 0.0)
     cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
     theta = np.append(base.state.theta, np.zeros(precision.size))
-    return replace(base, cross_products=cross_products, problem=problem, state=replace(base.state, theta=theta))
+    return replace(base, cross_products=cross_products, problem=problem).with_state(theta=theta)
 
 
 # ------------------------------------------------------------------------------

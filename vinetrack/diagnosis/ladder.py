@@ -34,7 +34,7 @@ from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, catalogue, find_effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
-from vinetrack.inference.errors import precision, trial_information, with_systematics, without
+from vinetrack.inference.errors import precision, with_systematics, without
 from vinetrack.inference.fit import aligned_to_trials, design_matrix, fit, rest_is_seen
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit
@@ -63,7 +63,7 @@ def candidates_of(
 def with_host(fit: Fit, host: Model | None) -> Fit:
     """Return a fit whose trajectories are simulated by the compiled form of a larger model."""
     predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
-    return replace(fit, predictor=predictor.with_steps_of(fit.predictor))
+    return replace(fit, solution=replace(fit.solution, predictor=predictor.with_steps_of(fit.predictor)))
 
 
 def initial_fit(model: Model, pairs: Pairs, candidates: Iterable[Effect], *, free: Iterable[str] = ()) -> Fit:
@@ -210,8 +210,8 @@ class AlignedTrials:
 
     @cached_property
     def information(self) -> tuple[Floats, Floats]:
-        """`trial_information` of the fit."""
-        return trial_information(self.fit.solution)
+        """Information and scores of each trial of the fit."""
+        return self.fit.solution.information()
 
     @cached_property
     def left_out(self) -> tuple[Floats, Floats]:
@@ -747,7 +747,7 @@ def against_the_sheet(fit: Fit) -> Iterator[Row]:
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
     fit adds to σ² for scatter comes on top.
     """
-    extended = with_systematics(fit.predictor, fit.solution).solution
+    extended = with_systematics(fit.solution).solution
     plain = np.diag(precision(extended).covariance)[: len(fit.numbers)]
     for fitted, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + fitted.sigma**2 - 2 * float(exact) * free.derivative(fitted.value) ** 2

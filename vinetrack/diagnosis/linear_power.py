@@ -48,7 +48,7 @@ from vinetrack.inference.errors import FEWEST_CLUSTERS
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
-from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root, trial_deviation_sd
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, matrix_root
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE, Predictor
 from vinetrack.planning.candidate_trials import at_solution, extended_fit, tracks_of
@@ -116,7 +116,7 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
     how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2}
-    return at_solution(start, predictor, solve(predictor, start.solution.problem, state, held, **how))
+    return at_solution(start, solve(predictor, start.solution.problem, state, held, **how))
 
 
 def _as_moved(trial_data: FitTrial, trajectory: Trajectory, origin_m: float) -> FitTrial:
@@ -404,7 +404,7 @@ def filmed_again(
     """
     predictor, state, trials = fitted.predictor, fitted.state, [trial.trial for trial in fitted.trials]
     trial_effects, problem = state.trial_effects.copy(), fitted.solution.problem
-    deviations = trial_deviation_sd(problem, state.spread) * draw.standard_normal((len(trials), 2))
+    deviations = problem.deviation_sd(state.spread) * draw.standard_normal((len(trials), 2))
     trial_effects[:, DEVIATION_COLUMNS] = np.where(problem.has_deviation, deviations, 0.0)
     trial_effects[:, RELEASE] -= draw.uniform(size=len(trials)) * predictor.frames_s
     jobs = predictor.jobs(state.theta, trial_effects)

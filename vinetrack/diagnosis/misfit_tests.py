@@ -34,15 +34,7 @@ from vinetrack.inference.errors import cluster_variance, coarsest_groups
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names, groups_of
 from vinetrack.inference.gaussian_processes import whiten
-from vinetrack.inference.marginal_likelihood import (
-    FitState,
-    MixedProblem,
-    at_prior_means,
-    eliminated,
-    inverse_of_block,
-    summed,
-    trial_effect_prior,
-)
+from vinetrack.inference.marginal_likelihood import FitState, MixedProblem, at_prior_means, eliminated, inverse_of_block
 from vinetrack.inference.optimiser import POOR_FIT, relative_residuals, track_correlation
 from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.systematics import systematics_of
@@ -293,14 +285,14 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 # ------------------------------------------------------------------------------
 # Columns of a fit and of candidates, and their cross products by trial, in this order: trial effects, unknowns (the
-# parameters of the fit and its systematic errors, which have a standard normal prior each), residual, shapes.
+# parameters of the fit and its systematic errors, which have a standard normal prior each), shapes, residual.
 
 
 @dataclass(frozen=True)
 class Products:
     """Cross products of columns of a fit, with its systematic errors, and of candidate shapes, in units of the noise,
-    with the residual at the prior means of trial effects, (n_trials, n_columns, n_columns). `problem` has systematic
-    errors as further parameters; to the effects in `silent` no trajectory responds at any plausible size.
+    with the residual, the last, at the prior means of trial effects, (n_trials, n_columns, n_columns). `problem` has
+    systematic errors as further parameters; to the effects in `silent` no trajectory responds at any plausible size.
     """
 
     white: Floats
@@ -319,8 +311,8 @@ class Products:
         return self.problem.index.shape[1]
 
     def without_trial_effects(self, state: FitState) -> Floats:
-        """Those of unknowns, residual and shapes, the trial effects integrated out."""
-        return eliminated(self.white, trial_effect_prior(self.problem, state)[1])[0]
+        """Those of unknowns, shapes and residual, the trial effects integrated out."""
+        return eliminated(self.white, self.problem.effect_priors(state)[1])[0]
 
 
 def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
@@ -333,15 +325,16 @@ def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
 def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
     """Cross products of a fit, of its systematic errors and of the candidates; no trial's columns are held twice."""
     responses, silent = _sensitivities(fit, shapes)
-    systematics = systematics_of(fit.predictor, fit.solution)
+    systematics = systematics_of(fit.solution)
     problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
-    residual = problem.n_effects + problem.index.shape[1]
-    white = np.empty((len(fit.trials), *2 * (residual + 1 + len(responding),)))
+    size = problem.n_effects + problem.index.shape[1] + len(responding) + 1
+    white = np.empty((len(fit.trials), size, size))
     for i, of_fit in enumerate(systematics.beside(fit.solution.columns)):
-        white[i] = in_noise(fit, i, np.column_stack([of_fit, *(moved[i] for _, moved in responses)]))
+        columns = [of_fit[:, :-1], *(moved[i] for _, moved in responses), of_fit[:, -1]]
+        white[i] = in_noise(fit, i, np.column_stack(columns))
         for _, moved in responses:
             moved[i] = np.empty(0)
-    return Products(at_prior_means(white, problem, fit.state, residual), problem, responding, tuple(silent))
+    return Products(at_prior_means(white, problem, fit.state), problem, responding, tuple(silent))
 
 
 @dataclass(frozen=True)
@@ -420,11 +413,12 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
     eliminated and the unknowns projected off.
     """
     state, problem, p = state or fit.state, products.problem, products.n_unknowns
-    X, r, C = slice(0, p), p, slice(p + 1, None)
+    X, C, r = slice(0, p), slice(p, -1), -1
     blocks = products.without_trial_effects(state)
     # Systematic errors are at their prior means.
     unknowns = np.append(state.theta, problem.prior_mean[state.theta.size :])
-    hessian, gradient, _ = summed(np.ascontiguousarray(blocks[:, : p + 1, : p + 1]), problem, unknowns)
+    of_fit = np.r_[:p, -1]
+    hessian, gradient, _ = problem.summed(blocks[:, of_fit[:, None], of_fit], unknowns)
     # Unknowns to which a trial does not respond are added up in a last row, and dropped.
     cross = np.zeros((problem.prior_mean.size + 1, blocks.shape[-1] - p - 1))
     np.add.at(cross, problem.index, blocks[:, X, C])
@@ -603,7 +597,7 @@ def exceeds_slow_errors(fit: Fit) -> bool:
     systematic = float(
         np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
     )
-    missed = relative_residuals(fit.predictor, fit.solution)
+    missed = relative_residuals(fit.solution)
     _, places = np.unique([trial_data.trial.condition for trial_data in data], return_inverse=True)
     shared = max((np.min(missed[places == k]) for k in np.flatnonzero(np.bincount(places) > 1)), default=0.0)
     beyond = max(np.median(missed), shared) > max(MISSED_FRACTION, systematic) or np.max(missed) > LARGEST_MISSED

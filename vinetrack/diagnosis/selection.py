@@ -108,7 +108,7 @@ class Search:
         the lack of an effect may predict no gain for it, not even the right sign. Returns all sets of this size.
         """
         tests, effects = (self.tests_after(base.fit), base.effects) if base else (self.tests, ())
-        if not self.tried and is_poor_fit(self.before.predictor, self.before.solution):
+        if not self.tried and is_poor_fit(self.before.solution):
             self._fit_from_afar()
         gains = {name: tests.predicted_gain(name) for name in dict.fromkeys(tests.products.effects)}
         # By significance: of several sizes, or sizes that scatter, chance gains more.
@@ -173,7 +173,7 @@ class Search:
         for start in [*starts, {}] if len(effect.parameters) > 1 else starts:
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
             credible = (known.fit for known in self.of_size(len(effects) + 1) if known.plausible and known.credible)
-            near = (fit.log_likelihood for fit in credible if not is_poor_fit(fit.predictor, fit.solution))
+            near = (fit.log_likelihood for fit in credible if not is_poor_fit(fit.solution))
             best, model = max(near, default=-math.inf), tests.fit.model + effect
             fit = full_fit(tests.fit, model, start=start, best=best)
             gain = -math.inf if fit is None else 2 * (fit.log_likelihood - tests.fit.log_likelihood)
@@ -365,7 +365,7 @@ def with_curves(fit: Fit) -> Fit:
     columns = predictor.linearise(state.theta, state.trial_effects)
     # Cross products stay those of the fit, whose columns were computed with other steps.
     solution = replace(fit.solution, columns=tuple(columns))
-    trials = assemble(former, solution, fit.left_out, fit.options).trials
+    trials = assemble(solution, fit.left_out, fit.options).trials
     return replace(fit, trials=trials, solution=solution)
 
 
@@ -481,7 +481,8 @@ def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
         return None
     report("letting the tail go slack")
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
-    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
+    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
+    slack = replace(fit, solution=replace(fit.solution, predictor=predictor))
     after = full_fit(slack, afresh=has_excess_scatter(fit))
     return None if after is None else likelihood_ratio(fit, (stand_in(TAIL_SLACK),), after)
 

@@ -31,17 +31,11 @@ from vinetrack.inference.fit_result import (
 )
 from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
-    FitState,
+    Linearised,
     MixedProblem,
-    at_prior_means,
-    at_unknowns,
-    eliminated,
     inverse_of_block,
-    levenberg_marquardt_step,
     matrix_root,
     solve_per_trial,
-    trial_effect_prior,
-    whitened_products,
     with_diagonal,
 )
 from vinetrack.inference.optimiser import (
@@ -50,10 +44,9 @@ from vinetrack.inference.optimiser import (
     LARGEST_DEVIATION,
     Solution,
     chi2_per_dof,
-    update_variances,
     variance_change,
 )
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE
 from vinetrack.inference.systematics import FILM_ERROR, systematics_of
 
 # ------------------------------------------------------------------------------
@@ -79,10 +72,10 @@ class Precision:
     shared: Mapping[str, Floats] = field(default_factory=dict)
 
 
-def precision(solution: Solution) -> Precision:
+def precision(solution: Linearised) -> Precision:
     """Covariance at the end of a fit, from the model of noise and between-trial variation."""
     problem = solution.problem
-    information = trial_information(solution)[0].sum(axis=0) + np.diag(problem.prior_precision)
+    information = solution.information()[0].sum(axis=0) + np.diag(problem.prior_precision)
     diagonal = np.diag(information)
     insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
     k, collinear = np.flatnonzero(problem.free & ~insensitive), np.zeros(diagonal.size, dtype=bool)
@@ -110,50 +103,44 @@ class WithSystematics(NamedTuple):
     gain: float
 
 
-def with_systematics(predictor: Predictor, solution: Solution) -> WithSystematics:
+def with_systematics(solution: Solution) -> WithSystematics:
     """Fit the systematic errors along with the parameters of a fit, to first order."""
-    errors = systematics_of(predictor, solution)
+    errors = systematics_of(solution)
     # The column of a parameter without influence is rounding error: with fixed columns, a step along it would be
     # millions of scales long and predict a likelihood that no trajectory confirms.
     fixed_insensitive = replace(solution.problem, free=solution.problem.free & ~precision(solution).insensitive)
     problem = errors.among(fixed_insensitive)
-    start = replace(
-        solution.state,
+    columns = tuple(errors.beside(solution.columns))
+    extended = replace(solution, problem=problem, columns=columns).with_state(
         theta=np.append(solution.state.theta, np.zeros(len(errors.sources))),
         trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
     )
-    columns = tuple(errors.beside(solution.columns))
-    extended = replace(solution, state=start, problem=problem, columns=columns)
-    reached, level = _newton_on_fixed_columns(predictor, extended)
+    reached, level = _newton_on_fixed_columns(extended)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # errors, so it is subtracted.
-    gain = level - _newton_on_fixed_columns(predictor, replace(solution, problem=fixed_insensitive))[1]
+    gain = level - _newton_on_fixed_columns(replace(solution, problem=fixed_insensitive))[1]
     return WithSystematics(replace(reached, problem=errors.among(solution.problem)), errors.sources, gain)
 
 
-def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[Solution, float]:
+def _newton_on_fixed_columns(solution: Solution) -> tuple[Solution, float]:
     """The solution after Newton steps at fixed sensitivities, while they raise ln L, and ln L there: two parameters
     that only rounding separates may get steps of any length along the direction in which they cancel.
     """
-
-    def estimated_at(products: Floats, state: FitState) -> tuple[Solution, float]:
-        after = update_variances(predictor, problem, products, state, solution.estimable, solution.noise_held)
-        now = replace(solution, state=after, cross_products=products)
-        return now, now.log_likelihood()
-
-    problem = solution.problem
-    solution, level = estimated_at(predictor.products(solution.columns), solution.state)
+    index = solution.problem.index
+    solution = replace(solution, cross_products=solution.predictor.products(solution.columns)).with_variances()
+    level = solution.log_likelihood()
     # The columns C and r of a trial become C and r − CΔ, and so do their products.
-    total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(predictor.data), 1, 1))
+    total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(index), 1, 1))
     for _ in range(15):  # (measured)
         state = solution.state
-        step, own_step, predicted_decrease = levenberg_marquardt_step(solution.cross_products, problem, state, 0.0)
+        step, own_step, predicted_decrease = solution.step(0.0)
         change = np.zeros_like(total_change)
-        change[:, :-1, -1] = -np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
+        change[:, :-1, -1] = -np.column_stack([own_step, np.append(step, 0.0)[index]])
         moved = np.eye(change.shape[-1]) + change
         products = np.swapaxes(moved, 1, 2)[:, None] @ solution.cross_products @ moved[:, None]
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after, new_level = estimated_at(products, before)
+        after = replace(solution, state=before, cross_products=products).with_variances()
+        new_level = after.log_likelihood()
         if not new_level >= level - CONVERGED_DECREASE:  # nor is NaN taken
             break
         solution, level, total_change = after, new_level, total_change + change
@@ -161,16 +148,6 @@ def _newton_on_fixed_columns(predictor: Predictor, solution: Solution) -> tuple[
             break
     columns = tuple(of_trial @ change for of_trial, change in zip(solution.columns, total_change, strict=True))
     return replace(solution, columns=columns), level
-
-
-def trial_information(solution: Solution) -> tuple[Floats, Floats]:
-    """Information, (n_trials, n_free, n_free), and scores, (n_trials, n_free), of each trial on the free parameters."""
-    problem = solution.problem
-    size, state = problem.prior_mean.size, solution.state
-    white = at_prior_means(whitened_products(solution.cross_products, state), problem, state, -1)
-    blocks, _ = eliminated(white, trial_effect_prior(problem, state)[1])
-    placed = at_unknowns(blocks, np.pad(problem.index, ((0, 0), (0, 1)), constant_values=size), size + 1)
-    return placed[:, :-1, :-1], placed[:, :-1, -1]
 
 
 # ------------------------------------------------------------------------------
@@ -184,28 +161,32 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
 FEWEST_CLUSTERS = 8  # Clusters from which their scatter counts in tests of a model (chosen)
 
 
-def robust_variances(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats, Floats]:
+def robust_variances(solution: Solution) -> tuple[Floats, Floats, Floats]:
     """Covariance of the free parameters by the noise model, (n_free, n_free); their variances from the scatter of
     trials, or of their clusters where these are larger, and the degrees of freedom of those, (n_free,).
     """
     problem, theta = solution.problem, solution.state.theta
-    information, scores = trial_information(solution)
+    information, scores = solution.information()
     plain = _covariance_by_noise(solution, information)
     # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
     depend = (problem.index[:, :, None] == np.arange(len(theta))).any(axis=1)
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
     variance, degrees = np.diag(plain), np.full(len(plain), np.inf)
-    trials = [trial_data.trial for trial_data in predictor.data]
+    trials = [trial_data.trial for trial_data in solution.predictor.data]
     for groups in (range(len(trials)), coarsest_groups(trials)):
         by_scatter, few = scatter_variances(
-            _summed_over(groups, information), _summed_over(groups, scores), problem, plain, len(predictor.layout.free)
+            _summed_over(groups, information),
+            _summed_over(groups, scores),
+            problem,
+            plain,
+            len(solution.predictor.layout.free),
         )
         degrees = np.where((by_scatter > variance) | np.isinf(degrees), few, degrees)
         variance = np.maximum(variance, by_scatter)
     return plain, variance, degrees
 
 
-def _covariance_by_noise(solution: Solution, information: Floats) -> Floats:
+def _covariance_by_noise(solution: Linearised, information: Floats) -> Floats:
     """Covariance of the unknowns by the noise model; those at a bound are fixed there."""
     problem, theta = solution.problem, solution.state.theta
     square = information.sum(axis=0) + np.diag(problem.prior_precision)
@@ -264,13 +245,11 @@ def scatter_variances(
     return variance, degrees
 
 
-def widened_covariance(
-    predictor: Predictor, solution: Solution, model_precision: Precision, sources: Sequence[str]
-) -> Precision:
+def widened_covariance(solution: Solution, model_precision: Precision, sources: Sequence[str]) -> Precision:
     """Covariance and degrees of freedom of the parameters of a fit with its systematic errors, the last unknowns, which
     come from these sources, widened by the scatter of trials.
     """
-    plain, variance, few = robust_variances(predictor, solution)
+    plain, variance, few = robust_variances(solution)
     diagonal = np.diag(plain)
     ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
     # Where the between-trial standard deviations are the usual ones, no trial had to tell them.
@@ -281,9 +260,9 @@ def widened_covariance(
     shared = {source: part * ratio**2 for source, part in shared_parts(plain, source_of).items()}
     if solution.problem.own_errors:
         exact = _with_known_pressures(solution)
-        known_by = np.diag(_covariance_by_noise(exact, trial_information(exact)[0]))
+        known_by = np.diag(_covariance_by_noise(exact, exact.information()[0]))
         shared["gauge"] = np.maximum(diagonal - known_by, 0.0) * ratio**2
-    n = len(predictor.layout.free)
+    n = len(solution.predictor.layout.free)
     return Precision(
         covariance[:n, :n],
         model_precision.insensitive[:n],
@@ -313,9 +292,8 @@ def _with_known_pressures(solution: Solution) -> Solution:
     """The solution without the errors that gauges leave in single trials."""
     own = np.s_[N_TRIAL_EFFECTS : solution.problem.n_effects]
     cross_products = np.delete(np.delete(solution.cross_products, own, axis=2), own, axis=3)
-    state = replace(solution.state, trial_effects=solution.state.trial_effects[:, :N_TRIAL_EFFECTS])
-    problem = replace(solution.problem, own_errors=0)
-    return replace(solution, cross_products=cross_products, state=state, problem=problem)
+    exact = replace(solution, cross_products=cross_products, problem=replace(solution.problem, own_errors=0))
+    return exact.with_state(trial_effects=solution.state.trial_effects[:, :N_TRIAL_EFFECTS])
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
@@ -378,12 +356,12 @@ def film_influence(fit: Fit) -> Floats:
     """
     if "film_mass" in fit.model:
         return np.zeros(len(fit.numbers))
-    errors = systematics_of(fit.predictor, fit.solution, ["film"])
-    solution = with_systematics(fit.predictor, fit.solution).solution
-    plain = robust_variances(fit.predictor, solution)[0]
+    errors = systematics_of(fit.solution, ["film"])
+    solution = with_systematics(fit.solution).solution
+    plain = robust_variances(solution)[0]
     products = fit.predictor.products(errors.beside(solution.columns))
     both = replace(solution, problem=errors.among(solution.problem), cross_products=products)
-    moved = (plain @ trial_information(both)[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
+    moved = (plain @ both.information()[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
@@ -397,11 +375,12 @@ ESTIMATES = tuple(entry.name for entry in fields(TrialEstimates))  # of each tri
 
 
 def fit_messages(
-    predictor: Predictor, solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
+    solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
 ) -> tuple[Remark, ...]:
     """Warnings on convergence, on each number and on the size of the residuals; notes on unequal weights of points and
     on positions that were smoothed before they were imported.
     """
+    predictor = solution.predictor
     told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
     for k, number in enumerate(numbers):
         named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
@@ -447,16 +426,15 @@ def fit_messages(
     return (*told, *(remark("smoothed", how=str(one), frames=one.decimation) for one in smoothed))
 
 
-def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, str], options: Mapping[str, Any]) -> Fit:
+def assemble(solution: Solution, left_out: Mapping[str, str], options: Mapping[str, Any]) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
-    layout = predictor.layout
-    with_errors = with_systematics(predictor, solution)
+    layout, with_errors = solution.predictor.layout, with_systematics(solution)
     extended, count = with_errors.solution, len(layout.free)
     by_noise = precision(extended)
-    precision_of_fit = widened_covariance(predictor, extended, by_noise, with_errors.sources)
-    numbers = _numbers(predictor, extended.state.theta, precision_of_fit)
+    precision_of_fit = widened_covariance(extended, by_noise, with_errors.sources)
+    numbers = _numbers(extended, precision_of_fit)
     slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
-    chi2 = chi2_per_dof(predictor, solution)
+    chi2 = chi2_per_dof(solution)
     points, state = solution.problem.points, extended.state
     variance = float(np.average(state.variance, weights=points)) / (1 - state.rho**2)
     # Yield pressures belong to the trials and stay in the numbers.
@@ -474,23 +452,22 @@ def assemble(predictor: Predictor, solution: Solution, left_out: Mapping[str, st
         noise_correlation=state.rho,
         chi2_per_dof=chi2,
         log_likelihood=solution.log_likelihood() + with_errors.gain,
-        trials=_trial_fits(predictor, solution, with_errors, by_noise.covariance[:count, :count]),
-        messages=fit_messages(predictor, solution, numbers, precision_of_fit, chi2),
+        trials=_trial_fits(solution, with_errors, by_noise.covariance[:count, :count]),
+        messages=fit_messages(solution, numbers, precision_of_fit, chi2),
         left_out=dict(left_out),
         converged=solution.converged,
         iterations=solution.iterations,
-        predictor=predictor,
         solution=solution,
         options=options,
         with_errors=state,
     )
 
 
-def _numbers(predictor: Predictor, theta: Floats, precision_of_fit: Precision) -> tuple[Number, ...]:
-    """The free parameters, the first entries of `theta`, with their errors and intervals."""
-    numbers, dof = [], precision_of_fit.degrees
+def _numbers(solution: Solution, precision_of_fit: Precision) -> tuple[Number, ...]:
+    """The free parameters, the first unknowns of a solution, with their errors and intervals."""
+    numbers, dof, layout = [], precision_of_fit.degrees, solution.predictor.layout
     sigmas = np.sqrt(np.diag(precision_of_fit.covariance))
-    of_parameters = zip(predictor.layout.free, *predictor.layout.bounds, theta.tolist(), strict=False)
+    of_parameters = zip(layout.free, *layout.bounds, solution.state.theta.tolist(), strict=False)
     for k, (free, lower, upper, at) in enumerate(of_parameters):
         reach, sigma = student(dof)[k] * sigmas[k], float(sigmas[k])
         low, high = (at - reach, at + reach) if math.isfinite(sigma) else (-math.inf, math.inf)
@@ -510,7 +487,7 @@ def _numbers(predictor: Predictor, theta: Floats, precision_of_fit: Precision) -
                 lower=free.from_scaled(float(lower)),
                 upper=free.from_scaled(float(upper)),
                 shared=shared if math.isfinite(sigma) else {},
-                pressure_unit=predictor.data[0].trial.pressure_unit,
+                pressure_unit=solution.predictor.data[0].trial.pressure_unit,
             )
         )
     return tuple(numbers)
@@ -518,9 +495,9 @@ def _numbers(predictor: Predictor, theta: Floats, precision_of_fit: Precision) -
 
 def _trial_effect_sigma(solution: Solution, covariance: Floats) -> Floats:
     """Standard errors of the trial effects, including those of the shared parameters, shape (n_trials, 4)."""
-    problem, state = solution.problem, solution.state
-    white = whitened_products(solution.cross_products, state)
-    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
+    problem, white = solution.problem, solution.white()
+    precision = problem.effect_priors(solution.state)[1]
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], precision)
     inverse = solve_per_trial(square, np.broadcast_to(np.eye(N_TRIAL_EFFECTS), square.shape))
     response = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
     shared = np.pad(np.where(np.isfinite(covariance), covariance, 0.0), (0, 1))
@@ -532,18 +509,16 @@ def _trial_effect_sigma(solution: Solution, covariance: Floats) -> Floats:
     return np.asarray(sigma)
 
 
-def _trial_fits(
-    predictor: Predictor, solution: Solution, with_errors: WithSystematics, covariance: Floats
-) -> tuple[TrialFit, ...]:
+def _trial_fits(solution: Solution, with_errors: WithSystematics, covariance: Floats) -> tuple[TrialFit, ...]:
     """The trials at a solution, with the deviations and whitened residuals of the fit that includes the systematic
     errors: one linear step, unbounded for a poor fit, so that the deviations are limited as those of a fit are.
     """
     state, sigma, reached = solution.state, _trial_effect_sigma(solution, covariance), with_errors.solution
-    trajectories = predictor.trajectories_at(state.theta, state.trial_effects)
+    trajectories = solution.predictor.trajectories_at(state.theta, state.trial_effects)
     deviations = np.clip(reached.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     effects = np.column_stack([state.trial_effects[:, :PRESSURE], deviations[:, PRESSURE:N_TRIAL_EFFECTS]])
     trials = []
-    for i, (one, moved) in enumerate(zip(predictor.data, trajectories, strict=True)):
+    for i, (one, moved) in enumerate(zip(solution.predictor.data, trajectories, strict=True)):
         white = whiten(reached.columns[i][:, -1], one.first, reached.state.rho, one.relative_sd)
         position_m, velocity_m_s, variance = moved.observed_position_m, moved.lead_velocity_m_s, state.variance[i]
         trial = trial_fit(one, effects[i], position_m, velocity_m_s, state.rho, float(variance), sigma[i])

@@ -26,11 +26,11 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
-from vinetrack.inference.errors import assemble, student, trial_fit, trial_information, without
+from vinetrack.inference.errors import assemble, student, trial_fit, without
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, none_to_fit, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.gaussian_processes import whiten
-from vinetrack.inference.marginal_likelihood import matrix_root, trial_deviation_sd
+from vinetrack.inference.marginal_likelihood import matrix_root
 from vinetrack.inference.optimiser import (
     CONVERGED_DECREASE,
     MOST_ITERATIONS,
@@ -83,7 +83,7 @@ def _calibrated(fit: Fit) -> tuple[float, float]:
     """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel, and
     the half width of the band in standard deviations.
     """
-    solution, known = fit.solution, trial_information(fit.solution)
+    solution, known = fit.solution, fit.solution.information()
     left_out = [(i, _leave_one_out(fit, *known, i)) for i in range(len(fit.trials))]
     predictable = [(i, *pair) for i, pair in left_out if pair is not None]
     if not predictable:
@@ -126,7 +126,7 @@ def _leave_one_out(fit: Fit, information: Floats, scores: Floats, i: int) -> tup
     step, root = known
     deviations, moved = [PRESSURE, DAMPING_DEVIATION], design_matrix(columns, problem.index[i], step.size)
     residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] - moved @ step
-    own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
+    own_sd = problem.deviation_sd(state.spread)[i] * problem.has_deviation[i]
     noise = float(state.variance[i]) / (1 - state.rho**2)
     return _aligned_error(fit, fit.predictor.data[i], columns, [moved @ root], own_sd, noise, residual)
 
@@ -316,7 +316,7 @@ def fit(
             f"The model {' + '.join(model.names)} moves no trial. Check growth_angle_deg (0 is straight down),"
             " pressure_kPa and yield_pressure_kPa, or add the effect that drives them to `model:`."
         )
-    return replace(assemble(predictor, solution, left_out, options), pairs=pairs)
+    return replace(assemble(solution, left_out, options), pairs=pairs)
 
 
 def refit(
@@ -412,7 +412,7 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, held, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    return replace(assemble(predictor, solution, before.left_out, options), pairs=before.pairs)
+    return replace(assemble(solution, before.left_out, options), pairs=before.pairs)
 
 
 def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:

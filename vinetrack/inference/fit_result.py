@@ -441,11 +441,15 @@ class Fit(NumberTable, Drawn):
     left_out: Mapping[str, str]
     converged: bool
     iterations: int
-    predictor: Predictor
     solution: Solution
     options: Mapping[str, Any]
     pairs: tuple[tuple[Trial, Track], ...] = ()
     with_errors: FitState | None = None
+
+    @property
+    def predictor(self) -> Predictor:
+        """Simulates the trials of the fit."""
+        return self.solution.predictor
 
     @property
     def state(self) -> FitState:

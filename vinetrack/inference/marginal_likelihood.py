@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +141,7 @@ def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, fl
 def added_up(
     blocks: Floats, index: NDArray[np.int_], prior_precision: Floats, deviation: Floats
 ) -> tuple[Floats, Floats, float]:
-    """`summed` of blocks, given the deviations of the parameters from the means of their priors, (n_free,)."""
+    """`MixedProblem.summed`, given the deviations of the parameters from the means of their priors, (n_free,)."""
     square, slope, keys = np.diag(prior_precision), -prior_precision * deviation, index.shape[1]
     total = np.sum(prior_precision * deviation**2)
     for i in range(len(blocks)):
@@ -158,7 +160,7 @@ def profiled(
     blocks: Floats, deviation_sd: Floats, index: NDArray[np.int_], prior_precision: Floats, deviation: Floats,
     below: Floats, above: Floats, free: NDArray[np.bool_], random: NDArray[np.bool_], restricted: bool,
 ) -> Floats:  # fmt: skip
-    """`deviances`, without their constant. Shapes: deviation_sd (n, n_trials, 2) → (n,)."""
+    """`Linearised.deviances`, without their constant. Shapes: deviation_sd (n, n_trials, 2) → (n,)."""
     deviances = np.empty(len(deviation_sd))
     for k in range(len(deviation_sd)):
         left, log_det = without_deviations(blocks, deviation_sd[k])
@@ -212,6 +214,7 @@ class MixedProblem:
     free: NDArray[np.bool_]
     points: Floats
     stretches: Floats
+    least_variance: Floats
     random: NDArray[np.bool_]
     own_errors: int = 0  #: systematic errors of a trial alone, its unknowns after its effects, with priors N(0, 1)
 
@@ -220,37 +223,45 @@ class MixedProblem:
         """Unknowns of each trial alone."""
         return N_TRIAL_EFFECTS + self.own_errors
 
+    def effect_priors(self, state: FitState) -> tuple[Floats, Floats]:
+        """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
+        n = self.index.shape[0]
+        centre, precision = np.zeros((n, self.n_effects)), np.ones((n, self.n_effects))
+        centre[:, :2], precision[:, :2] = self.release_origin_mean, self.release_origin_precision
+        precision[:, DEVIATION_COLUMNS] = 1 / np.maximum(self.deviation_sd(state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
+        return centre, precision
 
-def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
-    """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
-    n = problem.index.shape[0]
-    centre, precision = np.zeros((n, problem.n_effects)), np.ones((n, problem.n_effects))
-    centre[:, :2], precision[:, :2] = problem.release_origin_mean, problem.release_origin_precision
-    least_sd = np.maximum(trial_deviation_sd(problem, state.spread), LEAST_BETWEEN_TRIAL_SD)
-    precision[:, DEVIATION_COLUMNS] = 1 / least_sd**2
-    return centre, precision
+    def deviation_sd(self, spread: Floats | tuple[float, float]) -> Floats:
+        """Standard deviations of the deviations of pressure, of a measured one the gauge's error, and ln B of each
+        trial. Shapes: spread (..., 2) → (..., n_trials, 2).
+        """
+        sd = np.repeat(np.asarray(spread, dtype=float)[..., None, :], self.gauge_error.size, axis=-2)
+        sd[..., 0] = np.where(self.gauge_error > 0, self.gauge_error, sd[..., 0])
+        return sd
+
+    def held_releases(self, precision: Floats) -> Floats:
+        """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine
+        filmed at steady speed alone nothing tells the release: a full step would spoil that of all trials, and steps of
+        several frames would undo what `optimiser.likelier_releases` finds, time and again.
+        """
+        held = precision.copy()
+        held[:, RELEASE] += 1 / self.release_reach_s**2
+        return held
+
+    def penalty(self, state: FitState) -> float:
+        """Part of the priors of the free parameters in the penalised sum of squares."""
+        return float(np.sum(self.prior_precision * (state.theta - self.prior_mean) ** 2))
+
+    def summed(self, blocks: Floats, theta: Floats) -> tuple[Floats, Floats, float]:
+        """Normal equations of the free parameters, the blocks of keys and residual of all trials added up, and the
+        priors: information, slope (half the negative gradient), and the penalised sum of squares. Shapes: blocks
+        (n_trials, n_keys + 1, n_keys + 1); theta (n_free,).
+        """
+        return added_up(np.ascontiguousarray(blocks), self.index, self.prior_precision, theta - self.prior_mean)
 
 
-def trial_deviation_sd(problem: MixedProblem, spread: Floats | tuple[float, float]) -> Floats:
-    """Standard deviations of the deviations of pressure, of a measured one the gauge's error, and ln B of each trial.
-    Shapes: spread (..., 2) → (..., n_trials, 2).
-    """
-    sd = np.repeat(np.asarray(spread, dtype=float)[..., None, :], problem.gauge_error.size, axis=-2)
-    sd[..., 0] = np.where(problem.gauge_error > 0, problem.gauge_error, sd[..., 0])
-    return sd
-
-
-def shared_penalty(problem: MixedProblem, state: FitState) -> float:
-    """Part of the priors of the free parameters in the penalised sum of squares."""
-    return float(np.sum(problem.prior_precision * (state.theta - problem.prior_mean) ** 2))
-
-
-def summed(blocks: Floats, problem: MixedProblem, theta: Floats) -> tuple[Floats, Floats, float]:
-    """Normal equations of the free parameters, the blocks of keys and residual of all trials added up, and the priors:
-    information, slope (half the negative gradient), and the penalised sum of squares. Shapes: blocks (n_trials, n_keys
-    + 1, n_keys + 1); theta (n_free,).
-    """
-    return added_up(blocks, problem.index, problem.prior_precision, theta - problem.prior_mean)
+# ------------------------------------------------------------------------------
+# Linear algebra of the blocks of trials.
 
 
 def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
@@ -296,80 +307,34 @@ def with_diagonal(square: Floats, diagonal: Floats) -> Floats:
     return np.asarray(square + diagonal[:, :, None] * np.eye(diagonal.shape[1]))
 
 
-def whitened_products(cross_products: Floats, state: FitState) -> Floats:
-    """Cross products in units of the noise. Shapes: cross_products (n_trials, 3, k, k) → (n_trials, k, k)."""
-    return np.asarray(at_correlation(cross_products, state.rho) / state.variance[:, None, None])
+def matrix_root(square: Floats) -> Floats:
+    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix. Shapes: square (n, n) → (n, n)."""
+    values, vectors = np.linalg.eigh(square)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
-def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
-    """Cross products, (n_trials, k, k), changed in place: the residual is taken at zero deviations of pressure and ln B
-    and errors of single trials, and the priors of release and origin add their pull, and their penalty at the current
-    values.
+def at_prior_means(white: Floats, problem: MixedProblem, state: FitState) -> Floats:
+    """Whitened cross products, (n_trials, k, k), changed in place: the residual, their last column, is taken at zero
+    deviations of pressure and ln B and errors of single trials, and the priors of release and origin add their pull,
+    and their penalty at the current values.
     """
     columns = list(range(PRESSURE, state.trial_effects.shape[1]))
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
-    white[:, :, residual] += explained
-    white[:, residual, :] = white[:, :, residual]
+    white[:, :, -1] += explained
+    white[:, -1, :] = white[:, :, -1]
     # With r' = r + Z d, the product r'ᵀr' has the cross term rᵀZd twice, and dᵀZᵀZd.
-    white[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
+    white[:, -1, -1] += explained[:, -1] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
     offset = state.trial_effects[:, :2] - problem.release_origin_mean
     pull = problem.release_origin_precision * offset
-    white[:, :2, residual] -= pull
-    white[:, residual, :2] -= pull
-    white[:, residual, residual] += np.sum(pull * offset, axis=1)
+    white[:, :2, -1] -= pull
+    white[:, -1, :2] -= pull
+    white[:, -1, -1] += np.sum(pull * offset, axis=1)
     return white
 
 
 # ------------------------------------------------------------------------------
-# Steps towards the minimum of the penalised sum of squares: Gauss–Newton, damped, and within bounds.
-
-
-def levenberg_marquardt_step(
-    cross_products: Floats, problem: MixedProblem, state: FitState, damping: float
-) -> tuple[Floats, Floats, float]:
-    """Damped Gauss–Newton step of parameters, within the bounds, and of trial effects, which are eliminated before
-    (Schur complement) and follow by back-substitution; and the decrease of the penalised sum of squares along it by the
-    linear model. Shapes: cross_products (n_trials, 3, k, k) → (n_free,), (n_trials, n_effects).
-    """
-    precision = trial_effect_prior(problem, state)[1]
-    white = with_prior_gradient(cross_products, problem, state)
-    damped = precision + damping * (np.einsum("nkk->nk", white)[:, : problem.n_effects] + precision)
-    reduced, response = eliminated(white, held_releases(damped, problem))
-    of_keys = np.ascontiguousarray(white[:, problem.n_effects :, problem.n_effects :])
-    undamped, (information, slope, _) = (summed(blocks, problem, state.theta) for blocks in (of_keys, reduced))
-    square = information + np.diag(damping * np.diag(undamped[0]))
-    room = state.theta - problem.lower, problem.upper - state.theta
-    step, _ = step_within_bounds(square, slope, *room, problem.free)
-    step_of_keys = np.append(step, 0.0)[problem.index]
-    trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
-    # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
-    steps = np.hstack([trial_effect_step, step_of_keys])
-    curvature = np.einsum("nu,nuv,nv->", steps, white[:, :-1, :-1], steps, optimize=True)
-    prior_slope = problem.prior_precision * (problem.prior_mean - state.theta)
-    curvature += np.sum(precision * trial_effect_step**2) + np.sum(problem.prior_precision * step**2)
-    predicted_decrease = float(2 * (step @ prior_slope + np.sum(steps * white[:, :-1, -1])) - curvature)
-    return step, trial_effect_step, predicted_decrease
-
-
-def held_releases(precision: Floats, problem: MixedProblem) -> Floats:
-    """Precisions of the trial effects by which a step of the release over its reach, a frame, costs 1. Of a vine filmed
-    at steady speed alone nothing tells the release: a full step would spoil that of all trials, and steps of several
-    frames would undo what `optimiser.likelier_releases` finds, time and again.
-    """
-    held = precision.copy()
-    held[:, RELEASE] += 1 / problem.release_reach_s**2
-    return held
-
-
-def with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
-    """Whitened cross products; those of effects and residual, half a negative gradient, with the pull of priors."""
-    white = whitened_products(cross_products, state)
-    centre, precision = trial_effect_prior(problem, state)
-    white[:, : problem.n_effects, -1] -= precision * (state.trial_effects - centre)
-    white[:, -1, : problem.n_effects] = white[:, : problem.n_effects, -1]
-    return white
-
+# The campaign, linearised: its steps, variances, likelihood and information.
 
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
@@ -378,133 +343,194 @@ LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard devi
 CORRELATIONS = (-0.5, 0.97)
 
 
-def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> tuple[Floats, float]:
-    """Whitened cross products of [deviations, keys, residual] of each trial, release, origin and its own errors
-    eliminated, the residual taken at zero deviations; and the constant of −2 ln L. Shapes: cross_products (n_trials, 3,
-    k, k) → (n_trials, 2 + n_keys + 1, 2 + n_keys + 1).
+@dataclass(frozen=True)
+class Linearised:
+    """A campaign about the state of a fit. `cross_products`, (n_trials, 3, k, k), are those of trial effects, keys and
+    residual. `estimable` tells whether the between-trial standard deviations of pressure and of ln B are estimated,
+    `noise_held` that the noise is not.
     """
-    white = at_prior_means(whitened_products(cross_products, state), problem, state, -1)
-    precision = np.pad(problem.release_origin_precision, ((0, 0), (0, problem.own_errors)), constant_values=1.0)
-    if problem.own_errors:  # The deviations stay: they come after what is eliminated.
-        own = np.r_[N_TRIAL_EFFECTS : problem.n_effects]
-        order = np.r_[:PRESSURE, own, PRESSURE:N_TRIAL_EFFECTS, problem.n_effects : white.shape[-1]]
-        white = white[:, order[:, None], order]
-    log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
-    square = with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision)
-    log_alignment = np.sum(np.linalg.slogdet(square)[1] - np.log(precision).sum(axis=1))
-    constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
-    return eliminated(white, precision)[0], constant
 
+    problem: MixedProblem
+    state: FitState
+    cross_products: Floats
+    _: KW_ONLY
+    estimable: tuple[bool, bool] = (False, False)
+    noise_held: bool = False
 
-def deviances(
-    part: tuple[Floats, float], problem: MixedProblem, state: FitState, spreads: Floats, *, restricted: bool = True
-) -> Floats:
-    """−2 ln of the (restricted) likelihood at each of several between-trial standard deviations, profiled over the
-    parameters. Shapes: spreads (n, 2) → (n,).
-    """
-    sd = trial_deviation_sd(problem, spreads) * problem.has_deviation
-    prior, theta = problem.prior_precision, state.theta
-    room = theta - problem.lower, problem.upper - theta, problem.free, problem.random
-    found = profiled(part[0], sd, problem.index, prior, theta - problem.prior_mean, *room, restricted)
-    return np.asarray(found + part[1])
+    def with_state(self, **changes: Any) -> Self:
+        """The same blocks with other estimates, by name."""
+        return replace(self, state=replace(self.state, **changes))
 
+    def white(self) -> Floats:
+        """Cross products in units of the noise, (n_trials, k, k)."""
+        return np.asarray(at_correlation(self.cross_products, self.state.rho) / self.state.variance[:, None, None])
 
-def estimate_between_trial_sd(
-    part: tuple[Floats, float],
-    problem: MixedProblem,
-    state: FitState,
-    estimable: tuple[bool, bool],
-    *,
-    restricted: bool = True,
-) -> tuple[float, float]:
-    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search from
-    the best of a grid and the current values: there may be two maxima, since pressure and B can explain the same
-    variation. The current ones stay where others are hardly likelier: along the valley between pressure and B the
-    maximum moves far with every step of a fit. The restricted likelihood is multiplied by each standard deviation, so
-    that none ends at 0 (Chung et al., Psychometrika 78, 685, 2013: about one standard error from 0 then).
-    """
-    if not any(estimable):
-        return state.spread
-    largest = np.where(estimable, LARGEST_SPREAD, np.inf)
+    def with_prior_gradient(self) -> Floats:
+        """Whitened cross products; those of effects and residual, half a negative gradient, with the pull of priors."""
+        white, n = self.white(), self.problem.n_effects
+        centre, precision = self.problem.effect_priors(self.state)
+        white[:, :n, -1] -= precision * (self.state.trial_effects - centre)
+        white[:, -1, :n] = white[:, :n, -1]
+        return white
 
-    def best_of(spreads: Floats) -> tuple[Floats, float]:
-        spreads = np.where(estimable, np.clip(spreads, LEAST_BETWEEN_TRIAL_SD, largest), state.spread)
-        found = deviances(part, problem, state, spreads, restricted=restricted)
-        if restricted:
-            found -= 2 * np.sum(np.log(spreads), axis=1, where=estimable)
-        return spreads[np.argmin(found)], float(found.min())
-
-    current, at_current = best_of(np.array([state.spread]))
-    # Standard deviations from which the maximum of the likelihood is searched (chosen)
-    grid = np.array(list(itertools.product((0.001, 0.004, 0.01, 0.025, 0.06), repeat=2)))
-    best, lowest = min((current, at_current), best_of(grid), key=lambda found: found[1])
-    # 0.4, 2e-3, 1e-5: logarithms of the first and the last ratio of standard deviations that are compared, and decrease
-    # of −2 ln L that counts (chosen)
-    reach, ways = 0.4, np.array(list(itertools.product((-1, 0, 1), repeat=2)))
-    while reach > 2e-3:
-        there, value = best_of(best * np.exp(reach * ways))
-        best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-5 else (best, lowest, 0.5 * reach)
-    # 0.001: decrease of −2 ln L from which other standard deviations count as likelier (derived)
-    return (float(best[0]), float(best[1])) if lowest < at_current - 0.001 else state.spread
-
-
-def log_likelihood(
-    cross_products: Floats, problem: MixedProblem, state: FitState, estimable: tuple[bool, bool]
-) -> float:
-    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models."""
-    part = marginal(cross_products, problem, state)
-    spread = estimate_between_trial_sd(part, problem, state, estimable, restricted=False)
-    return -0.5 * float(deviances(part, problem, state, np.array([spread]), restricted=False)[0])
-
-
-def matrix_root(square: Floats) -> Floats:
-    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix. Shapes: square (n, n) → (n, n)."""
-    values, vectors = np.linalg.eigh(square)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
-
-
-def estimate_noise(
-    cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None
-) -> tuple[float, Floats]:
-    """Noise correlation of all trials and innovation variance of each, by restricted likelihood of the residuals after
-    the trial effects have been fitted.
-    """
-    centre, precision = trial_effect_prior(problem, state)
-    prior_precision, m = precision * state.variance[:, None], problem.n_effects
-    prior_gradient = prior_precision * (state.trial_effects - centre)
-    columns = [*range(m), cross_products.shape[-1] - 1]
-    of_effects = cross_products[:, :, columns][:, :, :, columns]
-    shared = np.count_nonzero(problem.free) / problem.index.shape[0]
-
-    def at(rhos: Floats) -> tuple[Floats, Floats, Floats]:
-        """−2 ln of the restricted likelihood, profiled over the variances, at each correlation; residual sums of
-        squares and their degrees of freedom, shape (n_rhos, n_trials).
+    def without_effects(self) -> tuple[Floats, Floats]:
+        """Whitened blocks of keys and residual, the trial effects integrated out; and the response of these, see
+        `eliminated`.
         """
-        white = at_correlation(of_effects, rhos[:, None, None, None])
-        residual, gradient = white[..., m, m], white[..., :m, m] - prior_gradient
-        scale = 1 / np.sqrt(np.einsum("...kk->...k", white)[..., :m] + prior_precision)
-        prior = prior_precision * scale**2 + RIDGE
-        information = scale[..., :, None] * white[..., :m, :m] * scale[..., None, :] + prior[..., None] * np.eye(m)
-        inverse = np.linalg.inv(information)
-        log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
-        kept = np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1)
-        dof = np.maximum(problem.points - shared - m + kept, 1.0)
-        explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
-        # 0.2: least part of the residual sum of squares that remains (chosen)
-        squares = np.maximum(residual - explained, 0.2 * residual)
-        scores = np.sum(dof * np.log(squares / dof) + log_det, axis=1)
-        return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), squares, dof
+        white = at_prior_means(self.white(), self.problem, self.state)
+        return eliminated(white, self.problem.effect_priors(self.state)[1])
 
-    if rho is None:
-        low, high = CORRELATIONS
-        # 4, 12: rounds of a search for the correlation, each between the neighbours of the best one of so many (chosen)
-        for _ in range(4):
-            grid = np.linspace(low, high, 12)
-            best = int(np.argmin(at(grid)[0]))
-            low, rho, high = grid[max(best - 1, 0)], float(grid[best]), grid[min(best + 1, 11)]
-    assert rho is not None
-    _, squares, degrees = at(np.array([rho]))
-    return rho, _shrink_to_common(squares[0], degrees[0])
+    def information(self) -> tuple[Floats, Floats]:
+        """Information, (n_trials, n_free, n_free), and scores, (n_trials, n_free), of each trial on the parameters."""
+        size = self.problem.prior_mean.size
+        index = np.pad(self.problem.index, ((0, 0), (0, 1)), constant_values=size)
+        placed = at_unknowns(self.without_effects()[0], index, size + 1)
+        return placed[:, :-1, :-1], placed[:, :-1, -1]
+
+    def step(self, damping: float) -> tuple[Floats, Floats, float]:
+        """Damped Gauss–Newton step of parameters, within the bounds, and of trial effects, which are eliminated before
+        (Schur complement) and follow by back-substitution; and the decrease of the penalised sum of squares along it by
+        the linear model. Shapes: (n_free,), (n_trials, n_effects).
+        """
+        problem, state, n = self.problem, self.state, self.problem.n_effects
+        precision, white = problem.effect_priors(state)[1], self.with_prior_gradient()
+        damped = precision + damping * (np.einsum("nkk->nk", white)[:, :n] + precision)
+        reduced, response = eliminated(white, problem.held_releases(damped))
+        undamped, _, _ = problem.summed(white[:, n:, n:], state.theta)
+        information, slope, _ = problem.summed(reduced, state.theta)
+        square = information + np.diag(damping * np.diag(undamped))
+        room = state.theta - problem.lower, problem.upper - state.theta
+        step, _ = step_within_bounds(square, slope, *room, problem.free)
+        step_of_keys = np.append(step, 0.0)[problem.index]
+        trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
+        # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
+        steps = np.hstack([trial_effect_step, step_of_keys])
+        curvature = np.einsum("nu,nuv,nv->", steps, white[:, :-1, :-1], steps, optimize=True)
+        prior_slope = problem.prior_precision * (problem.prior_mean - state.theta)
+        curvature += np.sum(precision * trial_effect_step**2) + np.sum(problem.prior_precision * step**2)
+        predicted_decrease = float(2 * (step @ prior_slope + np.sum(steps * white[:, :-1, -1])) - curvature)
+        return step, trial_effect_step, predicted_decrease
+
+    def with_variances(self, *, far_off: bool = False) -> Self:
+        """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
+        at = self
+        if not at.noise_held:
+            rho, variance = at.likeliest_noise(at.state.rho if far_off else None)
+            at = at.with_state(rho=rho, variance=np.maximum(variance, at.problem.least_variance))
+        return at if far_off else at.with_state(spread=at.likeliest_spread())
+
+    def likeliest_noise(self, rho: float | None = None) -> tuple[float, Floats]:
+        """Noise correlation of all trials and innovation variance of each, by restricted likelihood of the residuals
+        after the trial effects have been fitted.
+        """
+        problem, state, m = self.problem, self.state, self.problem.n_effects
+        centre, precision = problem.effect_priors(state)
+        prior_precision = precision * state.variance[:, None]
+        prior_gradient = prior_precision * (state.trial_effects - centre)
+        columns = [*range(m), -1]
+        of_effects = self.cross_products[:, :, columns][:, :, :, columns]
+        shared = np.count_nonzero(problem.free) / problem.index.shape[0]
+
+        def at(rhos: Floats) -> tuple[Floats, Floats, Floats]:
+            """−2 ln of the restricted likelihood, profiled over the variances, at each correlation; residual sums of
+            squares and their degrees of freedom, shape (n_rhos, n_trials).
+            """
+            white = at_correlation(of_effects, rhos[:, None, None, None])
+            residual, gradient = white[..., m, m], white[..., :m, m] - prior_gradient
+            scale = 1 / np.sqrt(np.einsum("...kk->...k", white)[..., :m] + prior_precision)
+            prior = prior_precision * scale**2 + RIDGE
+            information = scale[..., :, None] * white[..., :m, :m] * scale[..., None, :] + prior[..., None] * np.eye(m)
+            inverse = np.linalg.inv(information)
+            log_det = np.linalg.slogdet(information)[1] - 2 * np.log(scale).sum(axis=-1)
+            kept = np.sum(np.einsum("...kk->...k", inverse) * prior, axis=-1)
+            dof = np.maximum(problem.points - shared - m + kept, 1.0)
+            explained = np.einsum("...j,...jk,...k->...", scale * gradient, inverse, scale * gradient)
+            # 0.2: least part of the residual sum of squares that remains (chosen)
+            squares = np.maximum(residual - explained, 0.2 * residual)
+            scores = np.sum(dof * np.log(squares / dof) + log_det, axis=1)
+            return scores - np.sum(problem.stretches) * np.log(1 - rhos**2), squares, dof
+
+        if rho is None:
+            low, high = CORRELATIONS
+            # 4, 12: rounds of a search for the correlation, each between the neighbours of the best one of so many
+            # (chosen)
+            for _ in range(4):
+                grid = np.linspace(low, high, 12)
+                best = int(np.argmin(at(grid)[0]))
+                low, rho, high = grid[max(best - 1, 0)], float(grid[best]), grid[min(best + 1, 11)]
+        assert rho is not None
+        _, squares, degrees = at(np.array([rho]))
+        return rho, _shrink_to_common(squares[0], degrees[0])
+
+    @cached_property
+    def marginal(self) -> tuple[Floats, float]:
+        """Whitened cross products of [deviations, keys, residual] of each trial, release, origin and its own errors
+        eliminated, the residual taken at zero deviations, (n_trials, 2 + n_keys + 1, 2 + n_keys + 1); and the constant
+        of −2 ln L.
+        """
+        problem, state = self.problem, self.state
+        white = at_prior_means(self.white(), problem, state)
+        precision = np.pad(problem.release_origin_precision, ((0, 0), (0, problem.own_errors)), constant_values=1.0)
+        if problem.own_errors:  # The deviations stay: they come after what is eliminated.
+            own = np.r_[N_TRIAL_EFFECTS : problem.n_effects]
+            order = np.r_[:PRESSURE, own, PRESSURE:N_TRIAL_EFFECTS, problem.n_effects : white.shape[-1]]
+            white = white[:, order[:, None], order]
+        log_noise = np.sum(problem.points * np.log(state.variance))
+        log_noise -= np.sum(problem.stretches) * math.log(1 - state.rho**2)
+        square = with_diagonal(white[:, : precision.shape[1], : precision.shape[1]], precision)
+        log_alignment = np.sum(np.linalg.slogdet(square)[1] - np.log(precision).sum(axis=1))
+        constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
+        return eliminated(white, precision)[0], constant
+
+    def deviances(self, spreads: Floats, *, restricted: bool = True) -> Floats:
+        """−2 ln of the (restricted) likelihood at each of several between-trial standard deviations, profiled over the
+        parameters. Shapes: spreads (n, 2) → (n,).
+        """
+        (blocks, constant), problem, theta = self.marginal, self.problem, self.state.theta
+        sd = problem.deviation_sd(spreads) * problem.has_deviation
+        room = theta - problem.lower, problem.upper - theta, problem.free, problem.random
+        prior = problem.prior_precision, theta - problem.prior_mean
+        return np.asarray(profiled(blocks, sd, problem.index, *prior, *room, restricted) + constant)
+
+    def likeliest_spread(self, *, restricted: bool = True) -> tuple[float, float]:
+        """Between-trial standard deviations that maximise the restricted (or marginal) likelihood, by a pattern search
+        from the best of a grid and the current values: there may be two maxima, since pressure and B can explain the
+        same variation. The current ones stay where others are hardly likelier: along the valley between pressure and B
+        the maximum moves far with every step of a fit. The restricted likelihood is multiplied by each standard
+        deviation, so that none ends at 0 (Chung et al., Psychometrika 78, 685, 2013: about one standard error from 0
+        then).
+        """
+        estimable, present = self.estimable, self.state.spread
+        if not any(estimable):
+            return present
+        largest = np.where(estimable, LARGEST_SPREAD, np.inf)
+
+        def best_of(spreads: Floats) -> tuple[Floats, float]:
+            spreads = np.where(estimable, np.clip(spreads, LEAST_BETWEEN_TRIAL_SD, largest), present)
+            found = self.deviances(spreads, restricted=restricted)
+            if restricted:
+                found -= 2 * np.sum(np.log(spreads), axis=1, where=estimable)
+            return spreads[np.argmin(found)], float(found.min())
+
+        current, at_current = best_of(np.array([present]))
+        # Standard deviations from which the maximum of the likelihood is searched (chosen)
+        grid = np.array(list(itertools.product((0.001, 0.004, 0.01, 0.025, 0.06), repeat=2)))
+        best, lowest = min((current, at_current), best_of(grid), key=lambda found: found[1])
+        # 0.4, 2e-3, 1e-5: logarithms of the first and the last ratio of standard deviations that are compared, and
+        # decrease of −2 ln L that counts (chosen)
+        reach, ways = 0.4, np.array(list(itertools.product((-1, 0, 1), repeat=2)))
+        while reach > 2e-3:
+            there, value = best_of(best * np.exp(reach * ways))
+            best, lowest, reach = (there, value, 2 * reach) if value < lowest - 1e-5 else (best, lowest, 0.5 * reach)
+        # 0.001: decrease of −2 ln L from which other standard deviations count as likelier (derived)
+        return (float(best[0]), float(best[1])) if lowest < at_current - 0.001 else present
+
+    def log_likelihood(self) -> float:
+        """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare
+        models.
+        """
+        spread = self.likeliest_spread(restricted=False)
+        return -0.5 * float(self.deviances(np.array([spread]), restricted=False)[0])
 
 
 def _shrink_to_common(square: Floats, dof: Floats) -> Floats:

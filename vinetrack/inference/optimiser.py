@@ -27,19 +27,10 @@ from vinetrack.inference.marginal_likelihood import (
     CORRELATIONS,
     LARGEST_SPREAD,
     FitState,
+    Linearised,
     MixedProblem,
-    estimate_between_trial_sd,
-    estimate_noise,
-    held_releases,
-    levenberg_marquardt_step,
-    log_likelihood,
-    marginal,
-    shared_penalty,
     solve_per_trial,
-    trial_effect_prior,
-    whitened_products,
     with_diagonal,
-    with_prior_gradient,
 )
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -82,6 +73,7 @@ def subset(
     smaller.has_pressure_deviation = predictor.has_pressure_deviation[rows]
     smaller.has_damping_deviation = predictor.has_damping_deviation[rows]
     by_trial = "has_deviation gauge_error release_reach_s release_origin_mean release_origin_precision points stretches"
+    by_trial += " least_variance"
     by_parameter = "prior_mean prior_precision lower upper free random"
     problem = replace(
         problem,
@@ -107,8 +99,8 @@ def optimise_trial_effects(predictor: Predictor, problem: MixedProblem, state: F
     so precise that a step of the shared parameters leaves the curved valley, to which this step returns.
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-    white = with_prior_gradient(predictor.products(columns), problem, state)
-    precision = held_releases(trial_effect_prior(problem, state)[1], problem)
+    white = Linearised(problem, state, predictor.products(columns)).with_prior_gradient()
+    precision = problem.held_releases(problem.effect_priors(state)[1])
     square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], precision)
     step = solve_per_trial(square, white[:, :N_TRIAL_EFFECTS, -1:])[:, :, 0]
     moved = replace(state, trial_effects=moved_effects(state.trial_effects, step))
@@ -134,7 +126,7 @@ def trial_costs(
         residuals = predictor.residuals(state.theta, state.trial_effects)
     white = whiten(residuals, predictor.first, state.rho, predictor.relative_sd)
     squares = np.add.reduceat(white**2, predictor.starts[:-1])
-    centre, precision = trial_effect_prior(problem, state)
+    centre, precision = problem.effect_priors(state)
     return np.asarray(squares / state.variance + np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
@@ -155,7 +147,7 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
         return None
     releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
     jobs = predictor.jobs(state.theta, state.trial_effects)[places]
-    trial_effects, prior = state.trial_effects.copy(), np.stack(trial_effect_prior(problem, state), axis=1)
+    trial_effects, prior = state.trial_effects.copy(), np.stack(problem.effect_priors(state), axis=1)
     sensitivities = _release_sensitivities(predictor, jobs, releases)
     for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
         effects, gain = _best_release(predictor.data[i], i, state, prior[i], candidates_s, *sensitivity)
@@ -173,8 +165,9 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
     def deviances(state: FitState) -> Floats:
         """−2 ln L of each trial, its effects integrated out by the Laplace approximation."""
         columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-        square = whitened_products(predictor.products(columns), state)[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
-        log_volume = np.linalg.slogdet(with_diagonal(square, trial_effect_prior(problem, state)[1]))[1]
+        white = Linearised(problem, state, predictor.products(columns)).white()
+        square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], problem.effect_priors(state)[1])
+        log_volume = np.linalg.slogdet(square)[1]
         return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
 
     better = deviances(proposed) < deviances(current) - LEAST_DECREASE
@@ -283,6 +276,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
         free=np.ones(lower.size, dtype=bool),
         points=np.array([float(each.time_s.size) for each in data]),
         stretches=np.array([float(np.count_nonzero(each.first)) for each in data]),
+        least_variance=variance_floor(data),
         random=layout.random,
     )
 
@@ -326,28 +320,28 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
 POOR_FIT = 4.0
 
 
-def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
+def chi2_per_dof(solution: Solution) -> float:
     """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone."""
-    data, problem, rho = predictor.data, solution.problem, track_correlation(predictor.data)
-    noise = np.maximum(np.array([each.noise_m**2 for each in data]) * (1 - rho**2), variance_floor(data))
+    data, problem = solution.predictor.data, solution.problem
+    rho = track_correlation(data)
+    noise = np.maximum(np.array([each.noise_m**2 for each in data]) * (1 - rho**2), problem.least_variance)
     residual_squares = at_correlation(solution.cross_products, rho)[:, -1, -1]
     fitted = np.count_nonzero(problem.free) / len(data) + 2 + problem.has_deviation.any(axis=1)
     return float(np.sum(residual_squares / noise) / np.sum(np.maximum(problem.points - fitted, 1.0)))
 
 
-def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
+def is_poor_fit(solution: Solution) -> bool:
     """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth: slow
     errors of a few tenths of a millimetre may be far above the noise of a tracker, but are no reason to start anew.
     """
     # 3e-3: residual of the median trial, relative to its growth, above which a fit is poor (chosen)
-    missed = float(np.median(relative_residuals(predictor, solution)))
-    return chi2_per_dof(predictor, solution) > POOR_FIT and missed > 3e-3
+    return chi2_per_dof(solution) > POOR_FIT and float(np.median(relative_residuals(solution))) > 3e-3
 
 
-def relative_residuals(predictor: Predictor, solution: Solution) -> Floats:
-    """Root mean square residual of each trial, relative to its observed growth, shape (n_trials,)."""
+def relative_residuals(solution: Solution) -> Floats:
+    """Root mean square residual of each trial, relative to its growth, (n_trials,)."""
     rms_m = [math.sqrt(float(np.mean(columns[:, -1] ** 2))) for columns in solution.columns]
-    spans_m = [float(np.ptp(each.lead_position_m)) for each in predictor.data]
+    spans_m = [float(np.ptp(each.lead_position_m)) for each in solution.predictor.data]
     return np.asarray(rms_m / np.maximum(spans_m, 1e-9))
 
 
@@ -370,21 +364,19 @@ class FixedTerms:
 
 
 @dataclass(frozen=True)
-class Solution:
-    """Where the iterations ended, with sensitivities and residuals of each trial there, and their cross products."""
+class Solution(Linearised):
+    """Where the iterations ended, with sensitivities and residuals of each trial there."""
 
-    state: FitState
-    problem: MixedProblem
-    cross_products: Floats
+    predictor: Predictor
     columns: tuple[Floats, ...]
-    estimable: tuple[bool, bool]
-    converged: bool
-    iterations: int
-    noise_held: bool = False
+    converged: bool = False
+    iterations: int = 0
 
-    def log_likelihood(self) -> float:
-        """`marginal_likelihood.log_likelihood` at the state."""
-        return log_likelihood(self.cross_products, self.problem, self.state, self.estimable)
+    @classmethod
+    def at(cls, predictor: Predictor, problem: MixedProblem, state: FitState, **held: Any) -> Solution:
+        """Linearised about a state; `held` are `estimable` and `noise_held`."""
+        columns = tuple(predictor.linearise(state.theta, state.trial_effects))
+        return cls(problem, state, predictor.products(columns), predictor, columns, **held)
 
 
 @dataclass(frozen=True)
@@ -411,84 +403,67 @@ def solve(
     least: float = -math.inf,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence, or until ln L will clearly not reach `least`."""
-    fixed_terms, estimable_sd = fixed_terms or FixedTerms(), estimable(problem)
-    if fixed_terms.spread is not None:
-        state, estimable_sd = replace(state, spread=fixed_terms.spread), (False, False)
-    if noise_held := fixed_terms.noise is not None:
-        state = replace(state, rho=fixed_terms.noise[0], variance=fixed_terms.noise[1])
+    held, state = _held(fixed_terms or FixedTerms(), problem, state)
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
     damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
-    columns, cross_products = _linearise(predictor, state)
-    level, searched = -math.inf, False
+    at, level, searched = Solution.at(predictor, problem, state, **held), -math.inf, False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
-        before = state
+        before = at.state
         # Far off, noise correlation and differences between trials, which would take up the misfit, keep their values.
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
-        state = update_variances(predictor, problem, cross_products, state, estimable_sd, noise_held, far_off)
-        if state.rho == CORRELATIONS[1] and np.greater_equal(state.spread, LARGEST_SPREAD).all():
+        at = at.with_variances(far_off=far_off)
+        if at.state.rho == CORRELATIONS[1] and np.greater_equal(at.state.spread, LARGEST_SPREAD).all():
             break  # They have taken up what the model lacks.
-        variances_moved = variance_change(before, state)
-        full = levenberg_marquardt_step(cross_products, problem, state, 0.0)
-        damped = levenberg_marquardt_step(cross_products, problem, state, damping) if damping > 0 else full
+        full = at.step(0.0)
+        damped = at.step(damping) if damping > 0 else full
         predicted_decrease = full[2]
         predictor.is_central = predicted_decrease < far_decrease
         if least > -math.inf and not far_off:
-            level_before, level = level, log_likelihood(cross_products, problem, state, estimable_sd)
+            level_before, level = level, at.log_likelihood()
             # As much again as the last step gained, and twice what the next one promises, would not be enough.
             if level + max(level - level_before, predicted_decrease) < least:
                 break
         if watch is not None:
-            values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
+            values = zip(predictor.layout.free, predictor.layout.values(at.state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
         # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
         # release far from the current one?
         if (small_step and not searched) or iteration % 5 == 0:
-            relocated = likelier_releases(predictor, problem, state)
+            relocated = likelier_releases(predictor, problem, at.state)
             searched = small_step and relocated is None
             if relocated is not None:
-                state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
-                decrease = math.inf
+                at, decrease = Solution.at(predictor, problem, relocated, **held), math.inf
                 continue
-        if small_step and variances_moved < CONVERGED_VARIANCES and not far_off:
+        if small_step and variance_change(before, at.state) < CONVERGED_VARIANCES and not far_off:
             converged = predicted_decrease < far_decrease
             break
-        penalised_squares = cost(predictor, problem, state, residuals_in(columns))
+        penalised_squares = cost(predictor, problem, at.state, residuals_in(at.columns))
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
-        at = (predictor, problem, cross_products, state)
-        accepted, damping = _accepted_step(*at, damped[:2], damping, penalised_squares)
+        accepted, damping = _accepted_step(at, damped[:2], damping, penalised_squares)
+        if accepted is None:
+            decrease = 0.0
+            continue
         try:
-            if accepted is not None:
-                columns, cross_products = _linearise(predictor, accepted)
+            at = Solution.at(predictor, problem, accepted, **held)
         except SimulationError:
             # A perturbed trajectory of the new state cannot be simulated: the last state is still a result.
             break
-        state = accepted or state
-        decrease = penalised_squares - cost(predictor, problem, state, residuals_in(columns))
-    return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration, noise_held)
+        decrease = penalised_squares - cost(predictor, problem, accepted, residuals_in(at.columns))
+    return replace(at, converged=converged, iterations=iteration)
 
 
-def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
-    """Sensitivities and residuals at a state, and their cross products."""
-    columns = predictor.linearise(state.theta, state.trial_effects)
-    return columns, predictor.products(columns)
-
-
-def update_variances(
-    predictor: Predictor, problem: MixedProblem, cross_products: Floats, state: FitState,
-    estimable_sd: tuple[bool, bool], noise_held: bool, far_off: bool = False,
-) -> FitState:  # fmt: skip
-    """Estimate noise and between-trial standard deviations; of a fit that is far off only the size of the noise."""
-    if not noise_held:
-        rho, variance = estimate_noise(cross_products, problem, state, state.rho if far_off else None)
-        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if any(estimable_sd) and not far_off:
-        spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
-        state = replace(state, spread=spread)
-    return state
+def _held(fixed_terms: FixedTerms, problem: MixedProblem, state: FitState) -> tuple[dict[str, Any], FitState]:
+    """Which variance components are estimated, as a `Solution` states it, and the state with those that are not."""
+    estimated, noise = estimable(problem), fixed_terms.noise
+    if fixed_terms.spread is not None:
+        state, estimated = replace(state, spread=fixed_terms.spread), (False, False)
+    if noise is not None:
+        state = replace(state, rho=noise[0], variance=noise[1])
+    return {"estimable": estimated, "noise_held": noise is not None}, state
 
 
 def variance_change(before: FitState, after: FitState) -> float:
@@ -499,13 +474,13 @@ def variance_change(before: FitState, after: FitState) -> float:
 
 
 def _accepted_step(
-    predictor: Predictor, problem: MixedProblem, cross_products: Floats, state: FitState,
-    steps: tuple[Floats, Floats], damping: float, penalised_squares: float,
-) -> tuple[FitState | None, float]:  # fmt: skip
+    at: Solution, steps: tuple[Floats, Floats], damping: float, penalised_squares: float
+) -> tuple[FitState | None, float]:
     """The first state that lowers the penalised sum of squares, and the damping for the next step. A line search comes
     first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
     turn it across the valley.
     """
+    predictor, problem, state = at.predictor, at.problem, at.state
 
     def lowered(step: Floats, effect_step: Floats) -> FitState | None:
         theta = np.clip(state.theta + step, problem.lower, problem.upper)
@@ -514,7 +489,7 @@ def _accepted_step(
             reached, costs = optimise_trial_effects(predictor, problem, reached)
         except SimulationError:
             return None
-        return reached if float(np.sum(costs)) + shared_penalty(problem, reached) < penalised_squares else None
+        return reached if float(np.sum(costs)) + problem.penalty(reached) < penalised_squares else None
 
     # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
     # increased (chosen)
@@ -524,7 +499,7 @@ def _accepted_step(
             return candidate, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(11):
         damping = max(10 * damping, 1e-4)
-        candidate = lowered(*levenberg_marquardt_step(cross_products, problem, state, damping)[:2])
+        candidate = lowered(*at.step(damping)[:2])
         if candidate is not None:
             return candidate, damping * 0.1
     return None, 0.0
@@ -532,7 +507,7 @@ def _accepted_step(
 
 def cost(predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None) -> float:
     """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects."""
-    return float(np.sum(trial_costs(predictor, problem, state, residuals))) + shared_penalty(problem, state)
+    return float(np.sum(trial_costs(predictor, problem, state, residuals))) + problem.penalty(state)
 
 
 # ------------------------------------------------------------------------------
@@ -580,7 +555,7 @@ def _solved_for_part(
     effects, _ = align(predictor, theta, state.trial_effects)
     effects[rows] = reached.trial_effects
     reached = FitState(theta, effects, reached.spread, reached.rho, state.variance)
-    return reached, is_poor_fit(part, solution)
+    return reached, is_poor_fit(solution)
 
 
 def _solve_or_alike(
@@ -597,13 +572,13 @@ def _solve_or_alike(
     may differ again, if a few steps of that lead near the tracks.
     """
     solution = solve(predictor, problem, state, fixed_terms, least=least, **how)
-    if least > -math.inf or fixed_terms.spread is not None or not is_poor_fit(predictor, solution):
+    if least > -math.inf or fixed_terms.spread is not None or not is_poor_fit(solution):
         return solution
     try:
         alike = solve(predictor, problem, state, replace(fixed_terms, spread=ALIKE), **how)
         differing = replace(alike.state, spread=state.spread)
         solution = solve(predictor, problem, differing, fixed_terms, most_iterations=STEPS_TO_TELL)
-        if is_poor_fit(predictor, solution):
+        if is_poor_fit(solution):
             return alike
         return solve(predictor, problem, solution.state, fixed_terms, **how)
     except SimulationError:

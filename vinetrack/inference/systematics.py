@@ -67,21 +67,21 @@ class Systematics:
 Displaced = Mapping[int, tuple[Hashable, Floats]]
 
 
-def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[str] = SOURCES) -> Systematics:
+def systematics_of(solution: Solution, sources: Iterable[str] = SOURCES) -> Systematics:
     """The systematic errors of a fit that come from these sources: those of every fit, and `film`."""
-    functions: dict[str, Callable[[Predictor, Solution], Displaced]] = {
+    functions: dict[str, Callable[[Solution], Displaced]] = {
         "payloads": _payload_errors,
         "set pressures": _set_pressure_errors,
         "film": _film_errors,
         "tracking": _tracker_errors,
-        "lens": lambda *fit: {i: ("", shapes) for i, shapes in enumerate(position_shapes(fit[0], grown_in(*fit)))},
+        "lens": _lens_errors,
     }
-    data = predictor.data
+    data = solution.predictor.data
     columns: list[list[Floats]] = [[np.zeros((each.time_s.size, 0))] for each in data]
     places: list[list[int]] = [[] for _ in data]
     errors: dict[tuple[str, Hashable, int], int] = {}
     for source in filter(functions.__contains__, sources):
-        displaced = functions[source](predictor, solution)
+        displaced = functions[source](solution)
         width = max((moved_m.shape[1] for _, moved_m in displaced.values()), default=0)
         for i, (nothing, *_) in enumerate(columns):
             group, moved_m = displaced.get(i, (None, nothing))
@@ -89,18 +89,17 @@ def systematics_of(predictor: Predictor, solution: Solution, sources: Iterable[s
             places[i] += own + [-1] * (width - len(own))
             columns[i].append(np.pad(moved_m, ((0, 0), (0, width - len(own)))))
     index = np.array(places, dtype=int).reshape(len(data), -1)
-    alone = _gauge_errors(predictor, solution) if "gauge" in sources else [nothing for nothing, *_ in columns]
+    alone = _gauge_errors(solution) if "gauge" in sources else [nothing for nothing, *_ in columns]
     return Systematics(list(map(np.hstack, columns)), index, [source for source, *_ in errors], alone)
 
 
-def _changes_of(
-    predictor: Predictor, solution: Solution, varied: Sequence[tuple[int, FitTrial]]
-) -> Iterator[tuple[int, Floats]]:
+def _changes_of(solution: Solution, varied: Sequence[tuple[int, FitTrial]]) -> Iterator[tuple[int, Floats]]:
     """Indices of trials as they might be, and changes of position, (n_points, 1); nothing where one cannot be
     simulated.
     """
     if not varied:
         return
+    predictor = solution.predictor
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     trials = [i for i, _ in varied]
     once = list(dict.fromkeys(trials))
@@ -114,69 +113,69 @@ def _changes_of(
         yield i, position_change(plain[i], trajectory)[:, None]
 
 
-def _payload_errors(predictor: Predictor, solution: Solution) -> Displaced:
+def _payload_errors(solution: Solution) -> Displaced:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
-    carried = [each.trial.payload_kg > 0 and each.trial.travel_ratio != 1 for each in predictor.data]
-    bodies = [round(each.trial.payload_kg, 9) if so else None for each, so in zip(predictor.data, carried, strict=True)]
+    data = solution.predictor.data
+    carried = [each.trial.payload_kg > 0 and each.trial.travel_ratio != 1 for each in data]
+    bodies = [round(each.trial.payload_kg, 9) if so else None for each, so in zip(data, carried, strict=True)]
     # 1e-2, 0.5: relative step of a payload's mass for its derivative (derived), and standard deviation of the mass in
     # addition to that of the sheet, in such steps
-    return _changes_by(predictor, solution, "payload_kg", 1e-2, 0.5, bodies)
+    return _changes_by(solution, "payload_kg", 1e-2, 0.5, bodies)
 
 
-def _film_errors(predictor: Predictor, solution: Solution) -> Displaced:
+def _film_errors(solution: Solution) -> Displaced:
     """Error of the film mass of each vine, `FILM_ERROR`."""
-    vines = [each.trial.vine if each.trial.linear_density_kg_m > 0 else None for each in predictor.data]
-    return _changes_by(predictor, solution, "film_density_kg_m3", FILM_ERROR, 1.0, vines)
+    vines = [each.trial.vine if each.trial.linear_density_kg_m > 0 else None for each in solution.predictor.data]
+    return _changes_by(solution, "film_density_kg_m3", FILM_ERROR, 1.0, vines)
 
 
-def _changes_by(
-    predictor: Predictor, solution: Solution, name: str, step: float, sigma: float, groups: Sequence[Hashable]
-) -> Displaced:
+def _changes_by(solution: Solution, name: str, step: float, sigma: float, groups: Sequence[Hashable]) -> Displaced:
     """Displacement where a field of the sheet is larger by a relative step times `sigma`; none of a trial without
     group.
     """
     larger = [
         (i, replace(each, trial=replace(each.trial, **{name: (1 + step) * getattr(each.trial, name)})))
-        for i, each in enumerate(predictor.data)
+        for i, each in enumerate(solution.predictor.data)
         if groups[i] is not None
     ]
-    return {i: (groups[i], sigma * change_m) for i, change_m in _changes_of(predictor, solution, larger)}
+    return {i: (groups[i], sigma * change_m) for i, change_m in _changes_of(solution, larger)}
 
 
-def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Displaced:
+def _set_pressure_errors(solution: Solution) -> Displaced:
     """Error of the set pressure of each condition, shared by its replicates."""
+    varies = solution.predictor.has_pressure_deviation
     return {
         i: (each.trial.condition, PRESSURE_ERROR_PA / each.trial.pressure_Pa * solution.columns[i][:, [PRESSURE]])
-        for i, each in enumerate(predictor.data)
-        if predictor.has_pressure_deviation[i] and each.trace is None
+        for i, each in enumerate(solution.predictor.data)
+        if varies[i] and each.trace is None
     }
 
 
-def _gauge_errors(predictor: Predictor, solution: Solution) -> list[Floats]:
+def _gauge_errors(solution: Solution) -> list[Floats]:
     """Displacement by the errors that gauge noise leaves in each recorded pressure, but that of its mean, which is part
     of the fit: (n_points, n_errors), the same number for every trial.
     """
     misread = [
         (i, replace(each, trace=(each.trace[0], each.trace[1] + error_Pa)))
-        for i, each in enumerate(predictor.data)
+        for i, each in enumerate(solution.predictor.data)
         if each.trace is not None and each.trace_errors_Pa is not None
         for error_Pa in each.trace_errors_Pa.T
     ]
-    of_trial = [[np.zeros((each.time_s.size, 0))] for each in predictor.data]
-    for i, change_m in _changes_of(predictor, solution, misread):
+    of_trial = [[np.zeros((each.time_s.size, 0))] for each in solution.predictor.data]
+    for i, change_m in _changes_of(solution, misread):
         of_trial[i].append(change_m)
     width = max(map(len, of_trial))
     return [np.pad(np.hstack(moved_m), ((0, 0), (0, width - len(moved_m)))) for moved_m in of_trial]
 
 
-def _tracker_errors(predictor: Predictor, solution: Solution) -> Displaced:
+def _tracker_errors(solution: Solution) -> Displaced:
     """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
-    grown = grown_in(predictor, solution)
+    grown = grown_in(solution)
     # With extreme parameters no trial moves, and all growth fractions are zero.
     largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
     return {
         i: ("", _slow_shapes(growth_m / largest_growth_m, each.slow_m))
-        for i, (growth_m, each) in enumerate(zip(grown, predictor.data, strict=True))
+        for i, (growth_m, each) in enumerate(zip(grown, solution.predictor.data, strict=True))
         if each.slow_m is not None
     }
 
@@ -197,6 +196,11 @@ def _slow_shapes(part: Floats, slow_m: Floats) -> Floats:
     before_end = part - np.max(part)
     ends = [2.0 * usual * np.exp(before_end / 0.1), 4.0 * usual * np.exp(before_end / 0.03)]
     return np.column_stack([waves, excess * start, excess * (1 - start), slow_m * rest, *ends])
+
+
+def _lens_errors(solution: Solution) -> Displaced:
+    """Displacement by a lens, of all trials alike."""
+    return {i: ("", shapes) for i, shapes in enumerate(position_shapes(solution.predictor, grown_in(solution)))}
 
 
 def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
@@ -232,7 +236,7 @@ def with_unknowns(problem: MixedProblem, count: int, prior_precision: float | Fl
     )
 
 
-def grown_in(predictor: Predictor, solution: Solution) -> list[Floats]:
+def grown_in(solution: Solution) -> list[Floats]:
     """Growth of each trial by a fit, m, shape (n_points,)."""
-    of_trials = zip(predictor.data, solution.state.trial_effects[:, ORIGIN], solution.columns, strict=True)
+    of_trials = zip(solution.predictor.data, solution.state.trial_effects[:, ORIGIN], solution.columns, strict=True)
     return [trial_data.lead_position_m - origin_m - columns[:, -1] for trial_data, origin_m, columns in of_trials]

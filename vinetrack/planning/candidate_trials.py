@@ -246,21 +246,18 @@ def extended_fit(fit: Fit, films: Sequence[tuple[Condition, FitTrial]]) -> Fit:
     """The fit with further trials, as `filmed`, linearised at its parameters and not refitted."""
     predictor, problem, state = extended(fit, films)
     state.trial_effects[len(fit.trials) :] = 0.0
-    columns = tuple(predictor.linearise(state.theta, state.trial_effects))
-    cross_products = predictor.products(columns)
-    known = replace(fit.solution, state=state, problem=problem, columns=columns, cross_products=cross_products)
-    return at_solution(fit, predictor, known)
+    held = {name: getattr(fit.solution, name) for name in ("estimable", "noise_held", "converged", "iterations")}
+    return at_solution(fit, Solution.at(predictor, problem, state, **held))
 
 
-def at_solution(fit: Fit, predictor: Predictor, solution: Solution) -> Fit:
+def at_solution(fit: Fit, solution: Solution) -> Fit:
     """The fit with other data and state; its numbers and errors are not computed anew."""
-    state = solution.state
-    trials = []
-    of_trials = zip(predictor.data, state.trial_effects, solution.columns, state.variance, strict=True)
+    state, trials = solution.state, []
+    of_trials = zip(solution.predictor.data, state.trial_effects, solution.columns, state.variance, strict=True)
     for film, effects, columns, variance in of_trials:
         position_m = film.lead_position_m - effects[ORIGIN] - columns[:, -1]
         trials.append(trial_fit(film, effects, position_m, -columns[:, RELEASE], state.rho, float(variance)))
-    return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), with_errors=None)
+    return replace(fit, solution=solution, trials=tuple(trials), with_errors=None)
 
 
 # ------------------------------------------------------------------------------
