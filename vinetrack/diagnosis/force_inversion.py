@@ -34,7 +34,6 @@ from vinetrack.inference.gaussian_processes import LENGTH_SCALES, posterior, pro
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, FitState, Linearised, inverse_of_block
 from vinetrack.inference.optimiser import TYPICAL_SPREADS, track_correlation
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Jobs
-from vinetrack.inference.systematics import with_unknowns
 
 # ------------------------------------------------------------------------------
 # Motions, and the sensitivities of their positions to a small added force on the tail.
@@ -378,7 +377,8 @@ class ForceEquations:
         ]  # fmt: skip
         sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
         cross_products = np.stack([self._products(*of_trial) for of_trial in enumerate(sensitivities)])
-        self.joint, theta = with_unknowns(problem.prior, q, 0.0), np.append(point.theta, np.zeros(q))
+        places, theta = np.tile(np.arange(q), (len(point.motions), 1)), np.append(point.theta, np.zeros(q))
+        self.joint = problem.prior.with_unknowns(places, np.zeros(q))
         state = replace(problem.state, theta=theta, trial_effects=point.trial_effects)
         blocks, self.of_effects = Linearised(self.joint, state, cross_products).without_effects()
         square, slope, self.cost = self.joint.summed(blocks, theta)

@@ -33,7 +33,6 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE
-from vinetrack.inference.systematics import with_unknowns
 
 # ------------------------------------------------------------------------------
 # Hypotheses compared with the fit without them, and the answer set: those that the data cannot exclude.
@@ -489,23 +488,21 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> Solution:
         factors.append(np.ones(len(of_trials)))
         precisions.append(0.0)
     members = [[group for group in dict.fromkeys(of_trials) if group] for of_trials in groups]
-    first = base.problem.prior_mean.size + np.cumsum([0, *map(len, members)])
-    places = [
-        [begin + names.index(group) if group else -1 for group in of_trials]
-        for begin, names, of_trials in zip(first[:-1], members, groups, strict=True)
-    ]
-    precision = np.repeat(precisions, [len(names) for names in members])
-    problem = with_unknowns(base.problem, precision.size, precision)
-    problem = replace(
-        problem,
-        index=np.column_stack([base.problem.index, *places]),
-        random=np.append(base.problem.random, precision > 0),
+    first = np.cumsum([0, *map(len, members)])
+    places = np.transpose(
+        [
+            [begin + names.index(group) if group else -1 for group in of_trials]
+            for begin, names, of_trials in zip(first[:-1], members, groups, strict=True)
+        ]
     )
+    precision = np.repeat(precisions, [len(names) for names in members])
+    problem = base.problem.with_unknowns(places, precision)
+    problem = replace(problem, random=np.append(base.problem.random, precision > 0))
     size = base.cross_products.shape[-1]
     T = np.zeros((len(base.cross_products), size, size + len(columns)))
     T[:, range(size - 1), range(size - 1)] = T[:, -1, -1] = 1.0
     for k, (column, factor) in enumerate(zip(columns, factors, strict=True)):
-        T[:, column, size - 1 + k] = np.where(problem.index[:, base.problem.index.shape[1] + k] >= 0, factor, 0.0)
+        T[:, column, size - 1 + k] = np.where(places[:, k] >= 0, factor, 0.0)
     cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
     theta = np.append(base.state.theta, np.zeros(precision.size))
     return replace(base, cross_products=cross_products, problem=problem).with_state(theta=theta)

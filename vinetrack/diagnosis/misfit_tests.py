@@ -325,11 +325,11 @@ def in_noise(fit: Fit, i: int, columns: Floats) -> Floats:
 def products_of(fit: Fit, shapes: Sequence[CandidateShape]) -> Products:
     """Cross products of a fit, of its systematic errors and of the candidates; no trial's columns are held twice."""
     responses, silent = _sensitivities(fit, shapes)
-    systematics = systematics_of(fit.solution)
-    problem, responding = systematics.among(fit.solution.problem), tuple(shape for shape, _ in responses)
+    extended, responding = systematics_of(fit.solution).beside(fit.solution), tuple(shape for shape, _ in responses)
+    problem = extended.problem
     size = problem.n_effects + problem.index.shape[1] + len(responding) + 1
     white = np.empty((len(fit.trials), size, size))
-    for i, of_fit in enumerate(systematics.beside(fit.solution.columns)):
+    for i, of_fit in enumerate(extended.columns):
         columns = [of_fit[:, :-1], *(moved[i] for _, moved in responses), of_fit[:, -1]]
         white[i] = in_noise(fit, i, np.column_stack(columns))
         for _, moved in responses:

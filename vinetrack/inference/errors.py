@@ -105,21 +105,17 @@ class WithSystematics(NamedTuple):
 
 def with_systematics(solution: Solution) -> WithSystematics:
     """Fit the systematic errors along with the parameters of a fit, to first order."""
-    errors = systematics_of(solution)
+    errors, free = systematics_of(solution), solution.problem.free
     # The column of a parameter without influence is rounding error: with fixed columns, a step along it would be
     # millions of scales long and predict a likelihood that no trajectory confirms.
-    fixed_insensitive = replace(solution.problem, free=solution.problem.free & ~precision(solution).insensitive)
-    problem = errors.among(fixed_insensitive)
-    columns = tuple(errors.beside(solution.columns))
-    extended = replace(solution, problem=problem, columns=columns).with_state(
-        theta=np.append(solution.state.theta, np.zeros(len(errors.sources))),
-        trial_effects=np.pad(solution.state.trial_effects, ((0, 0), (0, problem.own_errors))),
-    )
-    reached, level = _newton_on_fixed_columns(extended)
+    held = replace(solution.problem, free=free & ~precision(solution).insensitive)
+    fixed = replace(solution, problem=held)
+    reached, level = _newton_on_fixed_columns(errors.beside(fixed))
+    problem = replace(reached.problem, free=np.append(free, np.ones(len(errors.sources), dtype=bool)))
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # errors, so it is subtracted.
-    gain = level - _newton_on_fixed_columns(replace(solution, problem=fixed_insensitive))[1]
-    return WithSystematics(replace(reached, problem=errors.among(solution.problem)), errors.sources, gain)
+    gain = level - _newton_on_fixed_columns(fixed)[1]
+    return WithSystematics(replace(reached, problem=problem), errors.sources, gain)
 
 
 def _newton_on_fixed_columns(solution: Solution) -> tuple[Solution, float]:
@@ -127,7 +123,7 @@ def _newton_on_fixed_columns(solution: Solution) -> tuple[Solution, float]:
     that only rounding separates may get steps of any length along the direction in which they cancel.
     """
     index = solution.problem.index
-    solution = replace(solution, cross_products=solution.predictor.products(solution.columns)).with_variances()
+    solution = solution.with_variances()
     level = solution.log_likelihood()
     # The columns C and r of a trial become C and r − CΔ, and so do their products.
     total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(index), 1, 1))
@@ -356,12 +352,10 @@ def film_influence(fit: Fit) -> Floats:
     """
     if "film_mass" in fit.model:
         return np.zeros(len(fit.numbers))
-    errors = systematics_of(fit.solution, ["film"])
     solution = with_systematics(fit.solution).solution
-    plain = robust_variances(solution)[0]
-    products = fit.predictor.products(errors.beside(solution.columns))
-    both = replace(solution, problem=errors.among(solution.problem), cross_products=products)
-    moved = (plain @ both.information()[0].sum(axis=0)[: len(plain), len(plain) :])[: len(fit.numbers)]
+    plain, n = robust_variances(solution)[0], solution.state.theta.size
+    information = systematics_of(fit.solution, ["film"]).beside(solution).information()[0].sum(axis=0)
+    moved = (plain @ information[:n, n:])[: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)

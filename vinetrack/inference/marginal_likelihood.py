@@ -223,6 +223,22 @@ class MixedProblem:
         """Unknowns of each trial alone."""
         return N_TRIAL_EFFECTS + self.own_errors
 
+    def with_unknowns(self, places: NDArray[np.int_], precision: Floats) -> MixedProblem:
+        """The problem with further parameters, each with a normal prior of mean 0 and given precision, (n_further,).
+        `places`, (n_trials, n_columns), tells to which of them a further column of a trial belongs, -1 for none.
+        """
+        count, known = precision.size, self.prior_mean.size
+        return replace(
+            self,
+            index=np.column_stack([self.index, np.where(places >= 0, known + places, -1)]),
+            prior_mean=np.append(self.prior_mean, np.zeros(count)),
+            prior_precision=np.append(self.prior_precision, precision),
+            lower=np.append(self.lower, np.full(count, -np.inf)),
+            upper=np.append(self.upper, np.full(count, np.inf)),
+            free=np.append(self.free, np.ones(count, dtype=bool)),
+            random=np.append(self.random, np.zeros(count, dtype=bool)),
+        )
+
     def effect_priors(self, state: FitState) -> tuple[Floats, Floats]:
         """Prior mean and precision of the trial effects, shape (n_trials, n_effects) each."""
         n = self.index.shape[0]

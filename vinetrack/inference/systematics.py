@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.marginal_likelihood import MixedProblem
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor, position_change
+from vinetrack.inference.sensitivity import ORIGIN, PRESSURE, Predictor, position_change
 
 PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
 
@@ -46,21 +45,26 @@ class Systematics:
     sources: Sequence[str]
     own: list[Floats]
 
-    def beside(self, columns: Sequence[Floats]) -> list[Floats]:
-        """Columns of a fit with those of the errors: of single trials after their effects, of several before the
-        residual. Shapes: columns (n_points, k) → (n_points, k + n_own + n_columns).
+    def beside(self, solution: Solution) -> Solution:
+        """A solution with the errors as further unknowns, each with a standard normal prior and still 0: the columns of
+        those of single trials come after their effects, of the others before the residual.
         """
-        n = N_TRIAL_EFFECTS
-        return [
+        problem, state, n = solution.problem, solution.state, solution.problem.n_effects
+        columns = tuple(
             np.column_stack([of_fit[:, :n], own, of_fit[:, n:-1], shared, of_fit[:, -1]])
-            for of_fit, own, shared in zip(columns, self.own, self.columns, strict=True)
-        ]
-
-    def among(self, problem: MixedProblem) -> MixedProblem:
-        """The problem of a fit with the errors as further unknowns, each with a standard normal prior."""
-        index = np.column_stack([problem.index, np.where(self.places >= 0, problem.prior_mean.size + self.places, -1)])
-        own = problem.own_errors + self.own[0].shape[1]
-        return replace(with_unknowns(problem, len(self.sources)), index=index, own_errors=own)
+            for of_fit, own, shared in zip(solution.columns, self.own, self.columns, strict=True)
+        )
+        count, own_errors = len(self.sources), self.own[0].shape[1]
+        problem = problem.with_unknowns(self.places, np.ones(count))
+        return replace(
+            solution,
+            problem=replace(problem, own_errors=problem.own_errors + own_errors),
+            columns=columns,
+            cross_products=solution.predictor.products(columns),
+        ).with_state(
+            theta=np.append(state.theta, np.zeros(count)),
+            trial_effects=np.pad(state.trial_effects, ((0, 0), (0, own_errors))),
+        )
 
 
 # By index of trial: what its errors are shared by, and its displacement by each, m, shape (n_points, n_errors)
@@ -219,21 +223,6 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
         sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - (-1.0) ** orders)
         for growth_m, sigma in zip(grown_m, sigma_m, strict=True)
     ]
-
-
-def with_unknowns(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
-    """The problem with further free parameters, each with a normal prior of mean 0 and on all trials."""
-    places = problem.prior_mean.size + np.arange(count)
-    return replace(
-        problem,
-        index=np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))]),
-        prior_mean=np.append(problem.prior_mean, np.zeros(count)),
-        prior_precision=np.append(problem.prior_precision, np.full(count, prior_precision)),
-        lower=np.append(problem.lower, np.full(count, -np.inf)),
-        upper=np.append(problem.upper, np.full(count, np.inf)),
-        free=np.append(problem.free, np.ones(count, dtype=bool)),
-        random=np.append(problem.random, np.zeros(count, dtype=bool)),
-    )
 
 
 def grown_in(solution: Solution) -> list[Floats]:
