@@ -5,8 +5,7 @@ estimate noise and between-trial standard deviations of the linear model, take a
 until neither changes.
 
 Release, origin and deviations of a trial are correlated, so that its misfit may have several local minima: above all
-where no frame shows it at rest, and where a vine starts so slowly that its first frames hardly differ from rest. Since
-a trajectory depends only on the time since release, one simulation, shifted in time, gives the misfit of every release.
+where no frame shows it at rest, and where a vine starts so slowly that its first frames hardly differ from rest.
 """
 
 from __future__ import annotations
@@ -38,10 +37,11 @@ from vinetrack.inference.sensitivity import (
     ORIGIN,
     PRESSURE,
     RELEASE,
-    Jobs,
     Predictor,
     align,
+    candidate_releases,
     initial_trial_effects,
+    over_time,
 )
 
 # ------------------------------------------------------------------------------
@@ -142,15 +142,18 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
     """The state with releases at which the trials' likelihoods are higher; None if there are none. They are proposed by
     the linear model, and kept where they remain better after a few steps on simulated trajectories.
     """
-    places = [i for i, trial_data in enumerate(predictor.data) if not trial_data.pressurised_in_recording]
-    if not places:
+    rows = np.flatnonzero([not each.pressurised_in_recording for each in predictor.data])
+    if not rows.size:
         return None
-    releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
-    jobs = predictor.jobs(state.theta, state.trial_effects)[places]
+    free, _, (current,) = subset(predictor, problem, rows, state)
+    releases = list(map(candidate_releases, free.data, current.trial_effects[:, RELEASE].tolist()))
+    dense = over_time(free, current.trial_effects[:, RELEASE], releases)
+    curves = dense.linearise(current.theta, current.trial_effects, trial_effects_only=True)
     trial_effects, prior = state.trial_effects.copy(), np.stack(problem.effect_priors(state), axis=1)
-    sensitivities = _release_sensitivities(predictor, jobs, releases)
-    for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
-        effects, gain = _best_release(predictor.data[i], i, state, prior[i], candidates_s, *sensitivity)
+    for k, i in enumerate(rows.tolist()):
+        since_s = dense.times_s[k] - state.trial_effects[i, RELEASE]
+        curve = curves[k][:, [*range(N_TRIAL_EFFECTS), -1]]
+        effects, gain = _best_release(predictor.data[i], i, state, prior[i], releases[k], since_s, curve)
         if gain > LEAST_DECREASE:
             trial_effects[i] = effects
     rows = np.flatnonzero((trial_effects != state.trial_effects).any(axis=1))
@@ -177,8 +180,7 @@ def likelier_releases(predictor: Predictor, problem: MixedProblem, state: FitSta
 
 
 def _best_release(
-    trial_data: FitTrial, i: int, state: FitState, prior: Floats, releases: Floats,
-    times: Floats, plain: Floats, sensitivities: Floats,
+    trial_data: FitTrial, i: int, state: FitState, prior: Floats, releases: Floats, times: Floats, curves: Floats
 ) -> tuple[Floats, float]:  # fmt: skip
     """Effects of trial i at its likeliest release, and the decrease of −2 ln L from the last of the releases. `prior`
     are mean and precision of its effects.
@@ -186,9 +188,9 @@ def _best_release(
     trial_effects, (centre, precision) = state.trial_effects[i], prior
     # Sensitivities and residual at every point for each release, shape (n_points, n_releases, 5), and whitened
     place = np.interp(trial_data.time_s[:, None] - releases, times, np.arange(times.size))
-    before, curves = np.minimum(place.astype(int), times.size - 2), np.column_stack([*sensitivities, plain])
+    before = np.minimum(place.astype(int), times.size - 2)
     columns = curves[before] + (place - before)[..., None] * np.diff(curves, axis=0)[before]
-    columns[..., -1] = (trial_data.lead_position_m - trial_effects[ORIGIN])[:, None] - columns[..., -1]
+    columns[..., -1] += trial_data.lead_position_m[:, None]
     white = whiten(columns, trial_data.first, state.rho, trial_data.relative_sd).transpose(1, 2, 0)
     square = white @ np.swapaxes(white, 1, 2) / float(state.variance[i])
     effects = np.tile(trial_effects, (releases.size, 1))
@@ -204,45 +206,6 @@ def _best_release(
     deviances = square[:, -1, -1] - explained + penalty + np.linalg.slogdet(information)[1]
     k = int(np.argmin(deviances))
     return effects[k], float(deviances[-1] - deviances[k])
-
-
-def _candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
-    """Candidate releases of a trial, s, shape (n,); the last is the current one."""
-    if trial_data.shows_rest:
-        # Candidate releases of a trial recorded at rest, frames from the current one, which comes last (chosen)
-        frames = [*np.arange(-14.0, 15.0), -0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6, 0.0]
-        return release_s + trial_data.frame_s * np.array(frames)
-    duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
-    # 60: candidate releases of a trial recorded only in motion (chosen)
-    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
-
-
-def _release_sensitivities(
-    predictor: Predictor, plain: Jobs, releases: Sequence[Floats]
-) -> list[tuple[Floats, Floats, Floats]]:
-    """For each trial times since release, shape (n,), positions there, m, and their sensitivities to its effects.
-    Sensitivities have shape (4, n), zero for an effect that the trial does not have.
-    """
-    damping_step, pressure_step = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
-    with_pressure = predictor.has_pressure_deviation[plain.trial]
-    with_damping = predictor.has_damping_deviation[plain.trial]
-    pressures, dampings = plain[np.flatnonzero(with_pressure)], plain[np.flatnonzero(with_damping)]
-    pressures = replace(pressures, pressure_deviation=pressures.pressure_deviation + pressure_step)
-    dampings.row[:, predictor.damping_column] *= np.exp(damping_step)
-    longest_s = np.array([predictor.data[i].time_s[-1] - s.min() for i, s in zip(plain.trial, releases, strict=True)])
-    # 600: points of the time grid of a trajectory that is shifted (derived)
-    grids = longest_s * np.linspace(0.0, 1.0, 600)[:, None] ** 1.5
-    grids = np.concatenate([grids.T, grids.T[with_pressure], grids.T[with_damping]])
-    jobs = Jobs.concatenated([plain, pressures, dampings])
-    moved = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
-    y = np.array([trajectory.observed_position_m for trajectory in moved])
-    n, n_pressures = len(plain), len(pressures)
-    sensitivities = np.zeros((n, N_TRIAL_EFFECTS, grids.shape[1]))
-    sensitivities[:, RELEASE] = [-np.gradient(along_m, times) for along_m, times in zip(y, grids[:n], strict=False)]
-    sensitivities[:, ORIGIN] = 1.0
-    sensitivities[with_pressure, PRESSURE] = (y[n : n + n_pressures] - y[:n][with_pressure]) / pressure_step
-    sensitivities[with_damping, DAMPING_DEVIATION] = (y[n + n_pressures :] - y[:n][with_damping]) / damping_step
-    return list(zip(grids, y, sensitivities, strict=False))
 
 
 # ------------------------------------------------------------------------------

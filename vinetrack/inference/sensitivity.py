@@ -178,7 +178,13 @@ class Predictor:
         self.is_central = False  # whether differences are central, of twice as many simulations
 
     def with_steps_of(self, other: Predictor) -> Predictor:
-        """The predictor with the finite differences to which another one of the same parameters has adapted."""
+        """The predictor with the deviations of another one of the same parameters and trials, and with the finite
+        differences to which that has adapted.
+        """
+        self.has_pressure_deviation, self.has_damping_deviation = (
+            other.has_pressure_deviation,
+            other.has_damping_deviation,
+        )
         self.steps, self.pressure_step = other.steps.copy(), other.pressure_step.copy()
         self.is_central = other.is_central
         return self
@@ -409,37 +415,65 @@ def middle_speed(trial_data: FitTrial) -> float:
     return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
 
 
+# ------------------------------------------------------------------------------
+# The release of a trial. Since a trajectory depends only on the time since release, one simulation, shifted in time,
+# gives the misfit of every release.
+
+
+def candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
+    """Releases among which that of a trial is searched, s, shape (n,); the last is the given one."""
+    if trial_data.pressurised_in_recording:
+        return np.array([release_s])
+    if trial_data.shows_rest:
+        # Candidate releases of a trial recorded at rest, frames from the given one, which comes last (chosen)
+        frames = [*np.arange(-14.0, 15.0), -0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6, 0.0]
+        return release_s + trial_data.frame_s * np.array(frames)
+    duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
+    # 60: candidate releases of a trial recorded only in motion (chosen)
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
+
+
+def over_time(predictor: Predictor, release_s: Floats, releases: Sequence[Floats]) -> Predictor:
+    """A predictor of positions relative to 0 of the same trials, released at given times, (n_trials,), until the ends
+    of their tracks would need them were they released at the earliest of these.
+    """
+    # 600: points of the time grid of a trajectory that is shifted, denser at its start (derived)
+    grid = np.linspace(0.0, 1.0, 600) ** 1.5
+    data = [
+        replace(
+            each,
+            time_s=begin_s + (each.time_s[-1] - candidates_s.min()) * grid,
+            lead_position_m=0 * grid,
+            first=grid == 0,
+            relative_sd=None,
+            smoothing=None,
+        )
+        for each, begin_s, candidates_s in zip(predictor.data, release_s, releases, strict=True)
+    ]
+    return Predictor(predictor.layout, data, predictor.host).with_steps_of(predictor)
+
+
 def align(predictor: Predictor, theta: Floats, trial_effects: Floats) -> tuple[Floats, Floats]:
-    """Best release and origin of each trial at given parameters, by a scan of one trajectory that is shifted in time.
-    Returns trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,);
-    trial_effects (n_trials, 4) → (n_trials, 4), (n_trials,).
+    """Best release and origin of each trial at given parameters. Returns trial_effects, misfit (ln of the root mean
+    square relative to the travel). Shapes: theta (n_free,); trial_effects (n_trials, 4) → (n_trials, 4), (n_trials,).
     """
     data = predictor.data
     # With the pressures of the sheet: the releases that suit deviations of another model start a fit in worse minima.
     of_sheet = {"pressure_deviation": np.zeros(len(data)), "yield_pressure_Pa": np.full(len(data), math.nan)}
     jobs = replace(predictor.jobs(theta, trial_effects), **of_sheet)
-    starts_s = np.minimum([each.time_s[0] for each in data], jobs.release_s)
-    durations = np.array([each.time_s[-1] for each in data]) - starts_s + 25 * predictor.frames_s
-    grids = [np.linspace(0.0, duration, 240) for duration in durations]
-    trajectories = predictor.run(jobs, list(jobs.release_s[:, None] + grids))
+    releases = [candidate_releases(*each) for each in zip(data, jobs.release_s.tolist(), strict=True)]
+    dense = over_time(predictor, jobs.release_s, releases)
     best, misfit = trial_effects.copy(), np.zeros(len(data))
-    for i, trial_data in enumerate(data):
+    for i, (trial_data, moved) in enumerate(zip(data, dense.run(jobs), strict=True)):
         begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
         # 60: points that are compared, most of them in motion (chosen)
         seen = np.unique(np.linspace(begin, trial_data.time_s.size - 1, 60).astype(int))
-        time_s, y = trial_data.time_s[seen], trial_data.lead_position_m[seen]
-        if trial_data.pressurised_in_recording:
-            shifts = np.zeros(1)
-        elif trial_data.shows_rest:
-            shifts = trial_data.frame_s * np.arange(-6, 3.01, 0.5)
-        else:
-            shifts = -np.geomspace(0.25 * trial_data.frame_s, durations[i], 30)
-        since = time_s[None, :] - trial_effects[i, RELEASE] - shifts[:, None]
-        predicted = np.interp(since, grids[i], trajectories[i].observed_position_m)
-        residual_m = y[None, :] - predicted
+        y = trial_data.lead_position_m[seen]
+        since_s = trial_data.time_s[seen] - releases[i][:, None]
+        residual_m = y - np.interp(since_s, moved.time_s, moved.observed_position_m)
         origin = residual_m.mean(axis=1)
         square = np.mean((residual_m - origin[:, None]) ** 2, axis=1)
         k = int(np.argmin(square))
-        best[i, RELEASE], best[i, ORIGIN] = trial_effects[i, RELEASE] + shifts[k], origin[k]
+        best[i, RELEASE], best[i, ORIGIN] = releases[i][k], origin[k]
         misfit[i] = 0.5 * np.log(square[k] / np.ptp(y) ** 2 + 1e-8)
     return best, misfit
