@@ -22,15 +22,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.gaussian_processes import at_correlation, whiten
-from vinetrack.inference.marginal_likelihood import (
-    CORRELATIONS,
-    LARGEST_SPREAD,
-    FitState,
-    Linearised,
-    MixedProblem,
-    solve_per_trial,
-    with_diagonal,
-)
+from vinetrack.inference.marginal_likelihood import FitState, Linearised, MixedProblem, solve_per_trial, with_diagonal
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -377,8 +369,6 @@ def solve(
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
         at = at.with_variances(far_off=far_off)
-        if at.state.rho == CORRELATIONS[1] and np.greater_equal(at.state.spread, LARGEST_SPREAD).all():
-            break  # They have taken up what the model lacks.
         full = at.step(0.0)
         damped = at.step(damping) if damping > 0 else full
         predicted_decrease = full[2]
@@ -393,11 +383,10 @@ def solve(
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
-        # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
-        # release far from the current one?
-        if (small_step and not searched) or iteration % 5 == 0:
+        if small_step and not searched:
+            # Before the fit ends: does a trial have a likelier release far from the current one?
             relocated = likelier_releases(predictor, problem, at.state)
-            searched = small_step and relocated is None
+            searched = relocated is None
             if relocated is not None:
                 at, decrease = Solution.at(predictor, problem, relocated, **held), math.inf
                 continue
@@ -552,17 +541,9 @@ def solve_onward(
     predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
-    are options of `_solve_or_alike`. From bad starting values the fit descends with the noise fixed first, and with
-    trials that are alike: noise and differences between trials would take up what the model can explain.
+    are options of `_solve_or_alike`.
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
-    state = replace(before.state, theta=theta)
-    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
-    if fixed_terms.noise is None and cost(predictor, problem, state) >= 1.5 * float(np.sum(problem.points)):
-        noise = FixedTerms(fixed_terms.spread or ALIKE, (state.rho, state.variance))
-        # 40, 10.0: steps at fixed noise, at most, and least decrease of the last (chosen)
-        reached = solve(predictor, problem, state, noise, most_iterations=40, least_decrease=10.0).state
-        state = replace(reached, spread=state.spread)
-    return _solve_or_alike(predictor, problem, state, fixed_terms, **how)
+    return _solve_or_alike(predictor, problem, replace(before.state, theta=theta), fixed_terms, **how)
