@@ -129,7 +129,7 @@ def _newton_on_fixed_columns(solution: Solution) -> tuple[Solution, float]:
     total_change = np.tile(np.eye(solution.cross_products.shape[-1]), (len(index), 1, 1))
     for _ in range(15):  # (measured)
         state = solution.state
-        step, own_step, predicted_decrease = solution.step(0.0)
+        step, own_step, predicted_decrease = solution.step()
         change = np.zeros_like(total_change)
         change[:, :-1, -1] = -np.column_stack([own_step, np.append(step, 0.0)[index]])
         moved = np.eye(change.shape[-1]) + change

@@ -403,23 +403,20 @@ class Linearised:
         placed = at_unknowns(self.without_effects()[0], index, size + 1)
         return placed[:, :-1, :-1], placed[:, :-1, -1]
 
-    def step(self, damping: float) -> tuple[Floats, Floats, float]:
-        """Damped Gauss–Newton step of parameters, within the bounds, and of trial effects, which are eliminated before
-        (Schur complement) and follow by back-substitution; and the decrease of the penalised sum of squares along it by
-        the linear model. Shapes: (n_free,), (n_trials, n_effects).
+    def step(self) -> tuple[Floats, Floats, float]:
+        """Gauss–Newton step of parameters, within the bounds, and of trial effects, which are eliminated before (Schur
+        complement) and follow by back-substitution; and the decrease of the penalised sum of squares along it by the
+        linear model. Shapes: (n_free,), (n_trials, n_effects).
         """
-        problem, state, n = self.problem, self.state, self.problem.n_effects
+        problem, state = self.problem, self.state
         precision, white = problem.effect_priors(state)[1], self.with_prior_gradient()
-        damped = precision + damping * (np.einsum("nkk->nk", white)[:, :n] + precision)
-        reduced, response = eliminated(white, problem.held_releases(damped))
-        undamped, _, _ = problem.summed(white[:, n:, n:], state.theta)
+        reduced, response = eliminated(white, problem.held_releases(precision))
         information, slope, _ = problem.summed(reduced, state.theta)
-        square = information + np.diag(damping * np.diag(undamped))
         room = state.theta - problem.lower, problem.upper - state.theta
-        step, _ = step_within_bounds(square, slope, *room, problem.free)
+        step, _ = step_within_bounds(information, slope, *room, problem.free)
         step_of_keys = np.append(step, 0.0)[problem.index]
         trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
-        # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
+        # 2 sᵀg − sᵀHs. Only where no bound and no held release shortens the step, so that Hs = g, is that sᵀg.
         steps = np.hstack([trial_effect_step, step_of_keys])
         curvature = np.einsum("nu,nuv,nv->", steps, white[:, :-1, :-1], steps, optimize=True)
         prior_slope = problem.prior_precision * (problem.prior_mean - state.theta)

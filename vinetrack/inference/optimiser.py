@@ -1,7 +1,7 @@
 """Maximum-likelihood iterations of the mixed-effects model: variance components and Gauss–Newton steps in turn.
 
 The method is that of Lindstrom & Bates, Biometrics 46, 673 (1990): linearise the model about the current trajectories,
-estimate noise and between-trial standard deviations of the linear model, take a damped Gauss–Newton step, and repeat
+estimate noise and between-trial standard deviations of the linear model, take a Gauss–Newton step, and repeat
 until neither changes.
 
 Release, origin and deviations of a trial are correlated, so that its misfit may have several local minima: above all
@@ -360,7 +360,7 @@ def solve(
     """Iterate the mixed-effects fit to convergence, or until ln L will clearly not reach `least`."""
     held, state = _held(fixed_terms or FixedTerms(), problem, state)
     far_decrease = 1e3  # Predicted decrease of −2 ln L from which a fit is far off (chosen)
-    damping, converged, iteration, predicted_decrease, decrease = 0.0, False, 0, math.inf, math.inf
+    converged, iteration, predicted_decrease, decrease = False, 0, math.inf, math.inf
     at, level, searched = Solution.at(predictor, problem, state, **held), -math.inf, False
     for iteration in range(1, most_iterations + 1):
         # Variance components of the model linearised about the current state, then a step of the parameters.
@@ -369,9 +369,7 @@ def solve(
         # 9: steps at most in which a fit counts as far off (chosen)
         far_off = predicted_decrease > far_decrease and iteration <= 9
         at = at.with_variances(far_off=far_off)
-        full = at.step(0.0)
-        damped = at.step(damping) if damping > 0 else full
-        predicted_decrease = full[2]
+        step, effect_step, predicted_decrease = at.step()
         predictor.is_central = predicted_decrease < far_decrease
         if least > -math.inf and not far_off:
             level_before, level = level, at.log_likelihood()
@@ -394,8 +392,8 @@ def solve(
             converged = predicted_decrease < far_decrease
             break
         penalised_squares = cost(predictor, problem, at.state, residuals_in(at.columns))
-        # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
-        accepted, damping = _accepted_step(at, damped[:2], damping, penalised_squares)
+        # Shorten the step until it lowers the penalised sum of squares; linearise about the new state.
+        accepted = _accepted_step(at, step, effect_step, penalised_squares)
         if accepted is None:
             decrease = 0.0
             continue
@@ -425,36 +423,21 @@ def variance_change(before: FitState, after: FitState) -> float:
     return float(max(*spreads, noise, abs(after.rho - before.rho)))
 
 
-def _accepted_step(
-    at: Solution, steps: tuple[Floats, Floats], damping: float, penalised_squares: float
-) -> tuple[FitState | None, float]:
-    """The first state that lowers the penalised sum of squares, and the damping for the next step. A line search comes
-    first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
-    turn it across the valley.
+def _accepted_step(at: Solution, step: Floats, effect_step: Floats, penalised_squares: float) -> FitState | None:
+    """The state after the longest part of a step, of those tried, that lowers the penalised sum of squares; None where
+    none does.
     """
     predictor, problem, state = at.predictor, at.problem, at.state
-
-    def lowered(step: Floats, effect_step: Floats) -> FitState | None:
-        theta = np.clip(state.theta + step, problem.lower, problem.upper)
+    for part in (1.0, 0.4, 0.15, 0.05, 0.015):  # (chosen)
+        theta = np.clip(state.theta + part * step, problem.lower, problem.upper)
         try:
-            reached = replace(state, theta=theta, trial_effects=moved_effects(state.trial_effects, effect_step))
+            reached = replace(state, theta=theta, trial_effects=moved_effects(state.trial_effects, part * effect_step))
             reached, costs = optimise_trial_effects(predictor, problem, reached)
         except SimulationError:
-            return None
-        return reached if float(np.sum(costs)) + problem.penalty(reached) < penalised_squares else None
-
-    # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
-    # increased (chosen)
-    for fraction in (1.0, 0.4, 0.15):
-        candidate = lowered(*(fraction * step for step in steps))
-        if candidate is not None:
-            return candidate, damping * 0.1 if damping > 1e-6 else 0.0
-    for _ in range(11):
-        damping = max(10 * damping, 1e-4)
-        candidate = lowered(*at.step(damping)[:2])
-        if candidate is not None:
-            return candidate, damping * 0.1
-    return None, 0.0
+            continue
+        if float(np.sum(costs)) + problem.penalty(reached) < penalised_squares:
+            return reached
+    return None
 
 
 def cost(predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Floats | None = None) -> float:
