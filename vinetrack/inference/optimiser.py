@@ -381,10 +381,11 @@ def solve(
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         # At a corner of the cost, where a frame crosses the end of growth, a step brings less than it promises.
         small_step = min(predicted_decrease, decrease) < least_decrease
-        if small_step and not searched:
-            # Before the fit ends: does a trial have a likelier release far from the current one?
+        # 5: steps between two searches (chosen). Now and then, and before the fit ends: does a trial have a likelier
+        # release far from the current one?
+        if (small_step and not searched) or iteration % 5 == 0:
             relocated = likelier_releases(predictor, problem, at.state)
-            searched = relocated is None
+            searched = small_step and relocated is None
             if relocated is not None:
                 at, decrease = Solution.at(predictor, problem, relocated, **held), math.inf
                 continue

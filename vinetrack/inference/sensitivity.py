@@ -429,8 +429,9 @@ def candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
         frames = [*np.arange(-14.0, 15.0), -0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6, 0.0]
         return release_s + trial_data.frame_s * np.array(frames)
     duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
-    # 60: candidate releases of a trial recorded only in motion (chosen)
-    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
+    # 160: candidate releases of a trial recorded only in motion. With 60 the maximum that is found depends on the start
+    # (measured).
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 160), release_s)
 
 
 def over_time(predictor: Predictor, release_s: Floats, releases: Sequence[Floats]) -> Predictor:
