@@ -213,6 +213,10 @@ def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
     yield "uncertainties included:"
     sources = dict.fromkeys((share.name, str(share.why)) for prediction in predictions for share in prediction.shares)
     yield from (f"  {name}: {text}" for name, text in sources)
+    for one in predictions[0].inputs.bands():
+        if one.why.code == "typical_size":
+            size, _, unit = _cells(one, predictions[0].inputs.trial.pressure_unit)
+            yield f"  {one.symbol}: {size} {unit}, {one.why}"
     yield ""
     conditions_of: dict[str, list[str]] = {}
     for prediction in predictions:
