@@ -221,7 +221,7 @@ class ArrivalTracker(Tracker):
 
 NO_GROWTH = (
     "see whether it shows this vine grow, four times as far from its background as a pixel's noise, name the right "
-    "recording, or state the growth axis, or by frames_used where it grows and does not draw back"
+    "recording, or state the growth axis, base first, or by frames_used where it grows and does not draw back"
 )
 
 # Asked in turn: the first that knows what moves follows it; the others return None.
