@@ -279,7 +279,7 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 
 def too_few(frames: int) -> str:
     """Say that a recording, or a picture taken for one, has too few frames."""
-    what = "is a single picture" if frames == 1 else f"has {frames} frames"
+    what = "holds a single picture" if frames == 1 else f"has {frames} frames"
     return f"{what}; a track needs at least {FEWEST_POINTS} frames"
 
 
