@@ -181,6 +181,8 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     if changes:
         left_out = ("not in the model", "at its usual size", "final speed at the medians", "")
         yield from ("", *table(changes, left_out, align="<<<>"))
+        if any(one.name == DAMPING and one.why.code == "fitted" for one in bands):
+            yield f"! {remark('left_out_of_fit')}"
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 

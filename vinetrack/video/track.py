@@ -358,7 +358,7 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
     lost_in_motion = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
     if lost_in_motion.any():
         count, first_lost = int(lost_in_motion.sum()), number[lost_in_motion][0]
-        notes.append(f"the leading edge is lost in {count} moving frames, first frame {first_lost}")
+        notes.append(f"moving frames in which the leading edge is lost: {count}, the first {first_lost}")
     return PointQuality(
         np.array(flags, dtype=np.str_), tuple(notes), first, last,
         first_outside if first_outside < n else None, without_edge,
