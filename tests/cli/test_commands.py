@@ -260,9 +260,10 @@ def test_numbers_that_are_given_have_no_error_unless_one_is_given():
 def test_a_sheet_is_a_row_a_condition(tmp_path):
     rows = "a,24,200,280,14,3,0\nb,24,200,280,14,3,0\nc,24,200,280,28,3,35.6\n"
     (tmp_path / "trials.csv").write_text(PLANNED_SHEET + rows)
+    (tmp_path / "experiment.yaml").write_text(f"model: [{', '.join(BASE_EFFECTS)}, tail_friction]\n")
     output = run("predict", tmp_path, *FEW, "--figure", tmp_path / "a.svg").output
-    assert row(output, "24mm-200um-280mm_14kPa_0g")[1] == "0.95"
-    assert row(output, "24mm-200um-280mm_28kPa_35.6g")[1] == "1"
+    assert [row(output, f"24mm-200um-280mm_{one}")[1] for one in ("14kPa_0g", "28kPa_35.6g")] == ["0.95", "1"]
+    assert "μ_s w: 0.500 N/m" in output
     assert len([line for line in output.splitlines() if line.startswith("24mm-200um-280mm_14kPa_0g")]) == 1
 
 

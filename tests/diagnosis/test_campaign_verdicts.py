@@ -135,7 +135,8 @@ def test_finite_sizes_are_in_equal_ratios_where_the_plausible_range_spans_powers
 def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_has_one():
     assert [shape.group for shape in misfit_tests.shapes_of(FILM)] == [""]
     told = [("", ()), ("a", ("b",)), ("b", ("a",))]
-    assert [(one.group, one.other_groups) for one in misfit_tests.shapes_of(FILM, TRIALS)] == told
+    for effect in (FILM, catalogue()["pressure_gauge"]):  # a yield pressure is read for each vine
+        assert [(one.group, one.other_groups) for one in misfit_tests.shapes_of(effect, TRIALS)] == told
     assert not any(shape.group for shape in misfit_tests.shapes_of(catalogue()["air_drag"], TRIALS))
     known = [replace(trial, day=str(1 + k % 2)) for k, trial in enumerate(TRIALS)]
     for of, days in ((known, ["day 1", "day 2"]), ([known[0], replace(known[1], day="")], ["a", "b"]), (known[:1], [])):
@@ -171,8 +172,7 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day_and_known_to
     first, second = row_of(said, "time_base").numbers
     assert (first.vine, second.vine) == ("day 1", "day 2")
     assert abs(first.value) < 3 * first.sigma < 0.02
-    assert 0.03 < abs(second.value) < 0.09
-    assert second.sigma < 0.01
+    assert 3 * second.sigma < 0.03 < abs(second.value) < 0.09
     # A band around a prediction takes over the error of the number of its day.
     fitted_by_day = vt.fit(vt.base_model() + "time_base", of_two_days)
     pairs = [pair for pair in fitted_by_day.pairs if pair[0].day == "2"]
@@ -191,8 +191,7 @@ def test_a_chamber_that_was_misread_is_a_depletion(tmp_path):
     rivals = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
     said = diagnosed(laboratory(tmp_path, "chamber_smaller", 902, (10, 14), weighed=False)[1], rivals)
     assert (said.effects, said.final_verdict) == (("reservoir_depletion",), "adequate")
-    (gamma,) = [number for number in said.parameters if number.key == "reservoir_depletion.gamma"]
-    assert gamma.value > 1.4
+    assert [one.value > 1.4 for one in said.parameters if one.key == "reservoir_depletion.gamma"] == [True]
 
 
 @pytest.mark.slow

@@ -6,7 +6,8 @@ Matters most near the yield pressure: 0.5 kPa is a tenth of P − P_y at 8 kPa o
 
 Read on one gauge, δ cancels in P − P_y and nothing changes.
 
-Easily taken for an error of P_y: in the base model P_y − δ is exactly the same, and no trial tells them apart.
+Easily taken for an error of P_y, which each vine has of its own: in the base model P_y − δ is exactly the same, and no
+trial tells them apart. A constant friction F of the tail is the same as δ = −2F/A.
 
 Reduce it by zeroing the gauge before each trial, and reading P_y on it too: an error of P_y looks exactly the same, so
 measure that again as well.
@@ -19,7 +20,9 @@ from vinetrack.effects import Parameter, Worked
 KIND = "measurement"
 ORDER = 5
 PARAMETERS = (
-    Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="true minus read pressure"),
+    Parameter(
+        "delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), shared="vine", plausible=(-2e3, 2e3), meaning="true minus read"
+    ),
 )
 
 

@@ -182,7 +182,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
             row.add_error(error, name, typed)
     if table.extra[index]:
         remedy = "put text that contains separators, and decimal commas, in quotes, or remove separators at its end"
-        row.add("more_cells", f"has {len(table.extra[index])} cells more than the header", remedy=remedy)
+        row.add("more_cells", "has more cells than the header", remedy=remedy)
     if not row.in_use:
         row.problems = [replace(problem, severity="warning") for problem in row.problems]
     return row
@@ -421,7 +421,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table:
     if not os.path.lexists(folder / SHEET):
         remedy = f"vinetrack setup FOLDER makes {SHEET} and {SETTINGS} from a folder of recordings or tracks"
         if close := closest_entry(folder / SHEET):
-            remedy = f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
+            remedy = f"if {close} is the sheet, save it as {SHEET}; else {remedy}"
         raise ExperimentError([Problem("missing", "is missing", file=SHEET, remedy=remedy)])
     table, found = read_sheet(folder / SHEET)
     problems += found

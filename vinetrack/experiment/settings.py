@@ -201,8 +201,8 @@ class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
     strict: bool = False
     """Whether a fault of one trial stops the whole experiment."""
     axis: AxisSettings | None = None
-    """The growth axis in the picture: from_px, to_px, width_mm, and via_px if it bends; found from the motion if
-    blank."""
+    """The growth axis in the picture: from_px (where growth begins), to_px, width_mm, and via_px if it bends; found
+    from the motion if blank."""
     calibration: Calibration | None = None
     """kind: charuco, checkerboard, two_points or mm_per_px, with the keys of that kind."""
     limits: Limits = Limits()

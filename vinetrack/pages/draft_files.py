@@ -145,7 +145,7 @@ def first_settings() -> str:
 # The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
 # (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
 calibration:
-# The growth axis in the picture (from_px, to_px, width_mm); found from the motion if blank.
+# The growth axis in the picture (from_px, where growth begins, to_px, width_mm); found from the motion if blank.
 axis:
 """
 

@@ -160,6 +160,7 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
 # every mark must look like the others, which tells a ruler from texture; the phase of the spacing gives their places.
 
 FEWEST_SPACINGS = 20  # Chosen: in texture up to 13 places look alike
+NOTES = (".txt", ".md", ".tsv", ".csv")  # Files of notes, as accepted by the page
 
 
 def ruler_in(picture: NDArray[Any]) -> dict[str, Any] | None:
@@ -280,7 +281,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         },
         "pictures": files.list_pictures(folder),
         "traces": files.list_tables(folder),
-        "notes": files.list_tables(folder, (".txt", ".md", ".tsv", ".csv")),
+        "notes": files.list_tables(folder, NOTES),
     }
 
 
@@ -510,7 +511,7 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     ]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
-    notes = [name for name in files.list_tables(folder, (".txt", ".md")) if name not in files.list_tracks(folder)]
-    if unread := [*notes, *files.list_pictures(folder)]:
+    tracks, tabled = files.list_tracks(folder), files.list_tables(folder, NOTES)
+    if unread := [*(name for name in tabled if name not in tracks), *files.list_pictures(folder)]:
         say(f"Not read here: {', '.join(unread)}. The page reads notes and rulers: vinetrack setup {folder}")
     say(f"Then: vinetrack check {folder}")

@@ -181,6 +181,8 @@ def _condition_lines(prediction: vines.VinePrediction) -> Iterator[str]:
     if changes:
         left_out = ("not in the model", "at its usual size", "final speed at the medians", "")
         yield from ("", *table(changes, left_out, align="<<<>"))
+        if any(one.name == DAMPING and one.why.code == "fitted" for one in bands):
+            yield f"! {remark('left_out_of_fit')}"
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 
@@ -213,6 +215,10 @@ def _table_lines(predictions: Sequence[vines.VinePrediction]) -> Iterator[str]:
     yield "uncertainties included:"
     sources = dict.fromkeys((share.name, str(share.why)) for prediction in predictions for share in prediction.shares)
     yield from (f"  {name}: {text}" for name, text in sources)
+    for one in predictions[0].inputs.bands():
+        if one.why.code == "typical_size":
+            size, _, unit = _cells(one, predictions[0].inputs.trial.pressure_unit)
+            yield f"  {one.symbol}: {size} {unit}, {one.why}"
     yield ""
     conditions_of: dict[str, list[str]] = {}
     for prediction in predictions:

@@ -183,7 +183,7 @@ def track_file(
     facts = recording_facts(measured, rate, 1e3 * measured.m_per_px if scaled else math.nan)
     rows = {name: number(fact) if isinstance(fact, float) else str(fact) for name, fact in facts.items()}
     ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
-    rows |= {"axis": "({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)}
+    rows |= {"axis": "({:z.0f}, {:z.0f}) → ({:z.0f}, {:z.0f}) px".format(*ends)}
     lines = table([(name, text) for name, text in rows.items() if text not in ("–", "None") and name != "notes"])
     lines += [] if math.isfinite(rate) else ["Capture rate unknown: without --capture-fps there are no times."]
     lines += [f"warning: {note}" for note in facts["notes"]]

@@ -221,7 +221,7 @@ class ArrivalTracker(Tracker):
 
 NO_GROWTH = (
     "see whether it shows this vine grow, four times as far from its background as a pixel's noise, name the right "
-    "recording, or state the growth axis, or by frames_used where it grows and does not draw back"
+    "recording, or state the growth axis, base first, or by frames_used where it grows and does not draw back"
 )
 
 # Asked in turn: the first that knows what moves follows it; the others return None.
@@ -279,7 +279,7 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 
 def too_few(frames: int) -> str:
     """Say that a recording, or a picture taken for one, has too few frames."""
-    what = "is a single picture" if frames == 1 else f"has {frames} frames"
+    what = "holds a single picture" if frames == 1 else f"has {frames} frames"
     return f"{what}; a track needs at least {FEWEST_POINTS} frames"
 
 
@@ -358,7 +358,7 @@ def assess_points(edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure:
     lost_in_motion = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
     if lost_in_motion.any():
         count, first_lost = int(lost_in_motion.sum()), number[lost_in_motion][0]
-        notes.append(f"the leading edge is lost in {count} moving frames, first frame {first_lost}")
+        notes.append(f"moving frames in which the leading edge is lost: {count}, the first {first_lost}")
     return PointQuality(
         np.array(flags, dtype=np.str_), tuple(notes), first, last,
         first_outside if first_outside < n else None, without_edge,
