@@ -31,7 +31,7 @@ BUDGETS = {
     "effects": (565, 3, 7),
     "experiment": (1600, 4, 15),
     "figures": (2028, 6, 19),
-    "inference": (4591, 11, 46),
+    "inference": (4633, 11, 46),
     "interface": (540, 1, 2),
     "kinematics": (1517, 4, 6),
     "laboratory": (1519, 5, 7),

@@ -59,26 +59,30 @@ def emptied(seed: int, noise_Pa: float = 50.0, beyond: int = 0) -> tuple[np.ndar
     return pressure_Pa, pressure_Pa + noise_Pa, GROWTH_M + noise_m
 
 
-@pytest.mark.parametrize("offset", [12.4, -7.8])
-def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset):
-    traces, growths, read_at = [], [], np.arange(0, FRAMES.size + 8, 8)
+@pytest.mark.parametrize(("offset", "lag"), [(12.4, 0.0), (-7.8, 0.0), (3.2, 9.0)])
+def test_the_clock_and_the_lag_of_a_gauge_are_estimated_from_all_trials(offset, lag):
+    truth_s, traces, growths, read_at = 1e-3 * np.array([offset, lag]), [], [], np.arange(0, FRAMES.size + 8, 8)
     for seed in range(12):
-        pressure_Pa, _, growth_m = emptied(seed)
-        at_gauge_Pa = np.interp(FRAMES + offset, FRAMES, pressure_Pa)
-        readings_Pa = np.interp(read_at, FRAMES, at_gauge_Pa)
+        shown_Pa, _, growth_m = emptied(seed)
+        for k in range(1, FRAMES.size if lag else 0):
+            shown_Pa[k] = shown_Pa[k - 1] + (shown_Pa[k] - shown_Pa[k - 1]) * -np.expm1(-1 / lag)
+        readings_Pa = np.interp(read_at + offset, FRAMES, shown_Pa)
         readings_Pa += 50.0 * np.random.default_rng(100 + seed).standard_normal(read_at.size)
         traces.append(np.interp(FRAMES, read_at, readings_Pa))
         growths.append(gauge.Growth(growth_m, 1e-3))
     read = gauge.gauge_readings(traces)
     noises = gauge.noise_of_traces(read, 0.0)
     recorded = [gauge.Recorded(*one) for one in zip(read, [FRAMES.size] * 12, noises, growths, strict=True)]
-    alone = np.array([gauge.gauge_clock([one]) for one in recorded])
-    together_s, sigma_s = gauge.gauge_clock(recorded)
-    # Each alone is off by a frame, twelve together by 1 / √12.
-    assert np.std(alone[:, 0]) < 1.3e-3
-    assert np.std(alone[:, 0]) < np.median(alone[:, 1]) < 2.5 * np.std(alone[:, 0])
-    assert together_s == pytest.approx(1e-3 * offset, abs=2.5 * sigma_s)
-    assert 0.2e-3 < sigma_s < 0.5e-3
+
+    def squared_error(clock):
+        """In units of both errors, which are independent along some axes: 2 on average."""
+        return float(np.sum((np.linalg.pinv(clock.errors_s.T) @ (clock.at_s - truth_s)) ** 2))
+
+    alone, together = [gauge.gauge_clock([one]) for one in recorded], gauge.gauge_clock(recorded)
+    sizes_s = [np.linalg.norm(clock.errors_s) for clock in (together, *alone)]
+    assert lag or 0.5 < np.mean(list(map(squared_error, alone))) < 3.5  # one trace alone shows no lag of nine frames
+    assert 0.1e-3 < sizes_s[0] < 0.5 * np.median(sizes_s[1:])
+    assert squared_error(together) < 9.2  # 99 % of two degrees of freedom
 
 
 @pytest.mark.slow
@@ -292,14 +296,14 @@ def test_an_error_of_a_trace_is_estimated(fit):
     """A trace bent by two of its standard deviations, in the trial that its bend moves most, is bent back."""
     shapes = systematics_of(fit.solution, ["gauge"])
     assert not shapes.sources
-    moves_m = [np.max(np.abs(columns[:, 1])) for columns in shapes.own]
+    moves_m = [np.max(np.abs(columns[:, 2])) for columns in shapes.own]
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)
     clock_s, pressure_Pa = data[which].trace
-    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 1]))
+    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * data[which].trace_errors_Pa[:, 2]))
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
     solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
-    after, place = with_systematics(solution).solution.state, (which, N_TRIAL_EFFECTS + 1)
+    after, place = with_systematics(solution).solution.state, (which, N_TRIAL_EFFECTS + 2)
     assert after.trial_effects[place] - fit.with_errors.trial_effects[place] == pytest.approx(-2.0, abs=0.5)
 
 

@@ -7,15 +7,15 @@ A trace is a constant and smooth functions of time and of the observed growth, s
 fills and has its corner where growth begins: Gaussian processes (`vinetrack.inference.gaussian_processes`) on the scale
 on which the pressure of an expanding gas is linear in the growth. Their size, how smooth they are, and what they depend
 on are averaged over by the evidence of all traces of a campaign together: where all other pressures are constant, a
-bend that one shows by chance counts as noise. The growth is shifted by the clock offset of gauge and camera. A trace
-that such functions do not explain is smoothed by a spline.
+bend that one shows by chance counts as noise. The growth is seen as by the gauge, whose clock differs from that of the
+camera and which may follow the pressure slowly. A trace that such functions do not explain is smoothed by a spline.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -376,6 +376,16 @@ class Growth:
     grown_m: Floats
     frame_s: float
 
+    def lagging(self, lag_s: float) -> Growth:
+        """The growth that a gauge with this time constant shows; of a negative one as far ahead."""
+        if lag_s == 0:
+            return self
+        lag, rate_m = abs(lag_s) / self.frame_s, np.diff(self.grown_m, prepend=self.grown_m[0])
+        # 12: time constants after which a gauge has forgotten a step (chosen)
+        memory = np.exp(-np.arange(min(math.ceil(12 * lag) + 1, rate_m.size)) / lag)
+        behind_m = lag * (1 - math.exp(-1 / lag)) * np.convolve(rate_m, memory)[: rate_m.size]
+        return replace(self, grown_m=self.grown_m - math.copysign(1.0, lag_s) * behind_m)
+
     def at(self, places: Floats) -> Floats:
         """Growth at places among the samples, m; constant before them, and beyond them at the speed of the last."""
         last = self.grown_m.size - 1
@@ -405,28 +415,28 @@ class Recorded:
         absolute = np.maximum(self.readings.values_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA)
         return np.asarray((absolute / self.typical_Pa) ** (-1 / GAMMA))
 
-    def at_samples(self, clock_s: float) -> Floats:
-        """Splines in time and in growth at all samples, shape (n_samples, n_splines)."""
+    def at_samples(self, clock_s: Floats) -> Floats:
+        """Splines in time and in growth at all samples, shape (n_samples, n_splines), by a clock, see `GaugeClock`."""
         return self._splines(np.arange(float(self.count)), clock_s)
 
-    def at_readings(self, clock_s: float) -> Floats:
+    def at_readings(self, clock_s: Floats) -> Floats:
         """The same at the readings, shape (n_readings, n_splines)."""
         if (edges := self.readings.edges) is not None:
             return np.asarray(np.add.reduceat(self.at_samples(clock_s), edges[:-1]) / np.diff(edges)[:, None])
         return self._splines(self.readings.places, clock_s)
 
-    def _splines(self, where: Floats, clock_s: float) -> Floats:
+    def _splines(self, where: Floats, clock_s: Floats) -> Floats:
         places = self.readings.places
         in_time = splines((where - places[0]) / (places[-1] - places[0]), TIME_SPLINES)
         in_growth = np.zeros((where.size, GROWTH_SPLINES))
         if self.growth is not None:
-            offset = clock_s / self.growth.frame_s
-            seen_m = self.growth.at(places + offset)
+            shown, offset = self.growth.lagging(clock_s[1]), clock_s[0] / self.growth.frame_s
+            seen_m = shown.at(places + offset)
             if np.ptp(seen_m) > 0:
-                in_growth = splines((self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m), GROWTH_SPLINES)
+                in_growth = splines((shown.at(where + offset) - seen_m[0]) / np.ptp(seen_m), GROWTH_SPLINES)
         return np.hstack([in_time, in_growth])
 
-    def equations(self, clock_s: float) -> Floats:
+    def equations(self, clock_s: Floats) -> Floats:
         """Triangular factor of the whitened columns constant, splines, readings, in units of the noise, which the scale
         of `part` makes larger where the pressure is high.
         """
@@ -469,28 +479,58 @@ def curves_of(factors: Floats, *kinds: Sequence[Floats]) -> tuple[Floats, Poster
     return products, posterior(products[:, :-1, :-1], products[:, :-1, -1], modes, amplitudes, log_odds)
 
 
-def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
-    """Delay from a reading to the growth that belongs to it, s, the same in all traces, and its standard deviation:
-    those of the evidence of curves in growth at offsets of up to 60 frames.
+@dataclass(frozen=True)
+class GaugeClock:
+    """Delay from a reading to the growth that belongs to it, and time constant with which the gauge follows, s, shape
+    (2,), the same in all traces; and independent errors of both, of a standard deviation each, shape (n_errors, 2).
     """
-    # 24: traces that tell the offset (chosen)
+
+    at_s: Floats
+    errors_s: Floats
+
+
+def gauge_clock(traces: Sequence[Recorded]) -> GaugeClock:
+    """The likeliest clock by the evidence of curves in growth, and its errors by the parabola through it there; without
+    a lag unless its own evidence, integrated over it, is higher (Laplace).
+    """
+    # 24: traces that tell the clock (chosen)
     telling = [trace for trace in traces if trace.growth is not None][:: len(traces) // 24 + 1]
     if not telling:
-        return 0.0, 0.0
-    step_s = float(np.median([trace.growth.frame_s for trace in telling if trace.growth]))
+        return GaugeClock(np.zeros(2), np.zeros((0, 2)))
+    frame_s = float(np.median([trace.growth.frame_s for trace in telling if trace.growth]))
     _, growth, both = kinds_of_curves()
-    log_evidence: dict[int, float] = {}
-    # 60, 4: largest offset and coarse steps, frames (chosen)
-    for offsets in (range(-60, 61, 4), range(-3, 4)):
-        centre = max(log_evidence, key=log_evidence.__getitem__, default=0)
-        for offset in (centre + step for step in offsets if centre + step not in log_evidence):
-            factors = np.array([trace.equations(offset * step_s) for trace in telling])
-            log_evidence[offset] = curves_of(factors, growth[:2], both)[1].log_evidence
-    at, value = (np.array(each, dtype=float) for each in zip(*sorted(log_evidence.items()), strict=True))
-    fine = np.arange(at[0], at[-1] + 0.05, 0.1)
-    weights = np.exp(np.interp(fine, at, value) - value.max())
-    mean = float(np.average(fine, weights=weights))
-    return step_s * mean, step_s * math.sqrt(float(np.average((fine - mean) ** 2, weights=weights)))
+
+    @cache
+    def evidence(clock: tuple[float, float]) -> float:
+        """Log evidence of delay and lag, frames, with their prior: few are more than 30 frames (chosen)."""
+        factors = np.array([trace.equations(frame_s * np.array([clock[0], abs(clock[1])])) for trace in telling])
+        return curves_of(factors, growth[:2], both)[1].log_evidence - 0.5 * (clock[0] ** 2 + clock[1] ** 2) / 30.0**2
+
+    def top(begins: Iterable[tuple[float, float]], lags: Sequence[int]) -> tuple[Floats, Floats]:
+        """The clock of highest evidence near the best beginning, and its errors, frames."""
+        at, step = max(begins, key=evidence), 2.0
+        while True:  # compass search, down to steps over which a parabola holds: ln L falls by at most 4 (chosen)
+            ways = np.array([*itertools.product((0, -1, 1), lags)], dtype=float)
+            around = [(at[0] + a * step, at[1] + b * step) for a, b in ways.tolist()]
+            before, at = at, max(around, key=evidence)
+            if at == before and evidence(at) - min(map(evidence, around)) < 4:
+                break
+            step = step / 2 if at == before else step
+        a, b = ways.T
+        square = np.column_stack([a**2, a * b, b**2, a, b, np.ones(a.size)])
+        aa, ab, bb, *slope, _ = np.linalg.lstsq(square, [evidence(clock) for clock in around])[0]
+        sharpness, axes = np.linalg.eigh([[-2 * aa, -ab], [-ab, -2 * bb]])
+        sharpness = np.maximum(sharpness, (step / 30.0) ** 2)
+        shift = np.clip(axes @ (axes.T @ slope / sharpness), -1, 1)
+        return at + step * shift, step * (axes / np.sqrt(sharpness)).T * [1, len(lags) > 1]
+
+    # 60, 4; 2 to 24: delays and lags from which the search begins, frames (chosen)
+    prompt = top(((delay, 0.0) for delay in range(-60, 61, 4)), (0,))
+    delays = prompt[0][0] + np.array([-4, 0, 4])
+    slow = top([(delay + lag, lag) for lag in (2.0, 4.0, 8.0, 16.0, 24.0) for delay in delays.tolist()], (0, -1, 1))
+    of_lag = math.log(abs(np.linalg.det(slow[1])) / (15.0 * np.linalg.norm(prompt[1])))  # half of its prior's width
+    at, errors = slow if evidence(tuple(slow[0])) + of_lag > evidence(tuple(prompt[0])) else prompt
+    return GaugeClock(frame_s * at, frame_s * errors)
 
 
 def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
@@ -537,10 +577,9 @@ class Curves:
     curves integrated out; `excess` is what they leave, in units of what noise may leave (F test).
     """
 
-    def __init__(self, traces: Sequence[Recorded], clock: tuple[float, float]) -> None:
-        self.traces = traces
-        self.clock_s, self.clock_sigma_s = clock
-        self.factors = np.array([trace.equations(self.clock_s) for trace in traces])
+    def __init__(self, traces: Sequence[Recorded], clock: GaugeClock) -> None:
+        self.traces, self.clock = traces, clock
+        self.factors = np.array([trace.equations(clock.at_s) for trace in traces])
         products, self.found = curves_of(self.factors, *kinds_of_curves())
         information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
         explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
@@ -561,14 +600,17 @@ class Curves:
         found = (self.found.mean, self.found.covariance)
         for trace, factor, mean, covariance in zip(self.traces, self.factors, *found, strict=True):
             constant = factor[0, -1] / factor[0, 0]
-            at_samples = trace.at_samples(self.clock_s) - factor[0, 1:-1] / factor[0, 0]
+            at_samples = trace.at_samples(self.clock.at_s) - factor[0, 1:-1] / factor[0, 0]
             part = np.maximum(-(constant + at_samples @ mean) / GAMMA, 0.01)
             variances, vectors = np.linalg.eigh(covariance)
-            earlier, later = (trace.at_samples(self.clock_s + sign * self.clock_sigma_s) for sign in (-1, 1))
+            by_clock = [
+                0.5 * (trace.at_samples(self.clock.at_s + off_s) - trace.at_samples(self.clock.at_s - off_s)) @ mean
+                for off_s in self.clock.errors_s
+            ]
             errors = np.column_stack([
                 np.full(part.size, 1 / factor[0, 0]),
                 at_samples @ (vectors * np.sqrt(np.maximum(variances, 0.0))),
-                0.5 * (later - earlier) @ mean,
+                *by_clock,
             ])  # fmt: skip
             errors_Pa = (trace.typical_Pa * part ** (-GAMMA - 1))[:, None] * errors
             means_Pa = errors_Pa.mean(axis=0)
@@ -577,7 +619,7 @@ class Curves:
             yield pressure_Pa, float(np.linalg.norm(means_Pa)), _principal_errors(errors_Pa - means_Pa, least_Pa)
 
 
-def _splined(trace: Recorded, clock: tuple[float, float]) -> tuple[Floats, float, Floats]:
+def _splined(trace: Recorded, clock: GaugeClock) -> tuple[Floats, float, Floats]:
     """A trace that no smooth function explains, by a smoothing spline with knots where the pressure bends (Dierckx, IMA
     J. Numer. Anal. 1, 267, 1981); of fewer than five readings lines. Its errors are those of the curve through it
     alone, as much larger as that leaves more than noise.
