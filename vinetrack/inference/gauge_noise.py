@@ -508,12 +508,13 @@ def gauge_clock(traces: Sequence[Recorded]) -> GaugeClock:
 
     def top(begins: Iterable[tuple[float, float]], lags: Sequence[int]) -> tuple[Floats, Floats]:
         """The clock of highest evidence near the best beginning, and its errors, frames."""
-        at, step = max(begins, key=evidence), 2.0
-        while True:  # compass search, down to steps over which a parabola holds: ln L falls by at most 4 (chosen)
+        at, step, free = max(begins, key=evidence), 2.0, np.array([1, len(lags) > 1])
+        # Compass search, down to steps over which a parabola holds: ln L falls by 4 at most, or 1/64 frame (chosen)
+        while True:
             ways = np.array([*itertools.product((0, -1, 1), lags)], dtype=float)
             around = [(at[0] + a * step, at[1] + b * step) for a, b in ways.tolist()]
             before, at = at, max(around, key=evidence)
-            if at == before and evidence(at) - min(map(evidence, around)) < 4:
+            if at == before and (evidence(at) - min(map(evidence, around)) < 4 or step <= 1 / 64):
                 break
             step = step / 2 if at == before else step
         a, b = ways.T
@@ -522,7 +523,7 @@ def gauge_clock(traces: Sequence[Recorded]) -> GaugeClock:
         sharpness, axes = np.linalg.eigh([[-2 * aa, -ab], [-ab, -2 * bb]])
         sharpness = np.maximum(sharpness, (step / 30.0) ** 2)
         shift = np.clip(axes @ (axes.T @ slope / sharpness), -1, 1)
-        return at + step * shift, step * (axes / np.sqrt(sharpness)).T * [1, len(lags) > 1]
+        return at + step * shift * free, step * (axes / np.sqrt(sharpness)).T * free
 
     # 60, 4; 2 to 24: delays and lags from which the search begins, frames (chosen)
     prompt = top(((delay, 0.0) for delay in range(-60, 61, 4)), (0,))
