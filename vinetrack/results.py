@@ -129,6 +129,13 @@ class Results:
     strip_figure = _Named("figures", prefix="strip_")  # The strip of one recording with its tracked edge
 
 
+def results_within(folder: Path) -> list[Path]:
+    """The results folders that stand in a folder that is neither one itself nor an experiment."""
+    if not folder.is_dir() or any((folder / name).exists() for name in ("trials.csv", "provenance.json")):
+        return []
+    return sorted(path.parent for path in folder.glob("*/provenance.json"))
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Say in a sentence that a file is not there, or that it does not hold what a stage wrote."""
@@ -137,6 +144,8 @@ def _reading(path: Path) -> Iterator[None]:
     except FileNotFoundError:
         if (path.parent / "trials.csv").exists() and not (path.parent / "experiment.json").exists():
             where = f"{path.parent} is an experiment: give its results, such as results/{path.parent.name}"
+        elif within := results_within(path.parent):
+            where = f"{path.parent} holds results folders: give one of them, such as {within[0]}"
         else:
             where = f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake"
         raise ResultsError(where) from None

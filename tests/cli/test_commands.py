@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import re
 import shutil
 import subprocess
 import sys
@@ -119,16 +118,12 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, 
     assert len(paths) == 6
     assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
 
-    output = succeed("add", "air_drag", results, "--json", tmp_path / "added.json")
-    assert re.search(r"Δχ² = -", output) is None
-    assert "highest pressure" in output
+    succeed("add", "air_drag", results, "--json", tmp_path / "added.json")
     added = json.loads((tmp_path / "added.json").read_text())["ladder"]
     assert [row["added"] for row in added] == ["", "air_drag"]
     assert len(ladder()) == 2  # that of the diagnosis stays
 
     output = succeed("add", "reservoir_depletion+leak", results, "--save")
-    assert "γ" in output
-    assert "1/τ" in output
     assert read_experiment_settings(folder / "experiment.yaml").model[-2:] == ("reservoir_depletion", "leak")
     assert command_for_results(folder, results) in output.replace("\n", " ")
     succeed("diagnose", results)  # of the model that was saved, with its fit

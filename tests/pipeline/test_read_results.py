@@ -48,6 +48,8 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
         with pytest.raises(ResultsError, match="delete it and run `vinetrack run` again"):
             read_fit(results)
     write_json(results.provenance, {})
+    with pytest.raises(ResultsError, match="such as"):  # the folder above holds results
+        read_fit(Results(tmp_path.parent))
     with pytest.raises(ResultsError, match="cannot be read"):
         read_source_experiment(tmp_path)
 

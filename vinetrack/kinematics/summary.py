@@ -397,11 +397,14 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         final_m = settings.final_at_fraction * trial.length_m
         final = lead_velocity_at(travel_m, kinematics.lead_velocity_m_s, final_m)
     warnings = list(track.notes)
-    if motion.release.moving_from_start or not math.isfinite(motion.release.time_s):
-        warnings.append(motion.release.reason)
+    release, notes = motion.release, list[str]()
+    if release.time_s < track.time_s[0]:  # before the first point, as where a tip comes out of a launcher's mouth
+        notes.append(release.reason)
+    elif release.moving_from_start or not math.isfinite(release.time_s):
+        warnings.append(release.reason)
     if "user" in windows and (windows["user"].doubtful or not windows["user"].accepted):
         warnings.append(windows["user"].reason)
-    notes = [*warnings, *([] if steady.force else [f"no steady window: {windows['gated'].reason}"])]
+    notes = [*warnings, *notes, *([] if steady.force else [f"no steady window: {windows['gated'].reason}"])]
     row = {
         "trial": trial.name,
         "vine": trial.vine,

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems, remark
 from vinetrack.core.process import waiting
 from vinetrack.core.tables import write_bytes, write_text
-from vinetrack.results import CLAIM_FILE, claim, locked, refuse_shared_results
+from vinetrack.results import CLAIM_FILE, claim, locked, refuse_shared_results, results_within
 
 if TYPE_CHECKING:
     from vinetrack.core.records import Track, Trial
@@ -248,6 +248,9 @@ def find_experiment(folder: Path) -> Path:
     if experiment := claim(folder / CLAIM_FILE).get("experiment", ""):
         remedy = f"give {experiment}; vinetrack run {experiment} finishes results that were stopped"
         raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=remedy)])
+    if within := results_within(folder):
+        remedy = f"give one of them, such as {within[0]}, or an experiment"
+        raise ExperimentError([Problem(message="holds results folders", file=str(folder), remedy=remedy)])
     if folder.exists():
         return folder
     close = closest_entry(folder)
@@ -470,6 +473,15 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
         for name, why in not_measured(tracks).items()
     ]
+    lasts_s = {trial: facts.duration_s for trial, facts in surveyor.facts.items()}
+    lasts_s |= {trial: float(track.time_s[-1]) for trial, track in tracks}
+    for trial, end_s in lasts_s.items():
+        if trial.steady_window_s is not None and trial.steady_window_s[1] > 1.5 * end_s:  # 1.5: rounded up (chosen)
+            beyond, remedy = f"ends beyond the recording, which lasts {end_s:.3g} s", "write the window in seconds"
+            problem = Problem(
+                "window", beyond, "steady", severity="warning", file=SHEET, trial=trial.name, remedy=remedy
+            )
+            problems.append(replace(problem, line=experiment.lines.get(trial.name, 0)))
     for told, severity in ((longer_than_stated(tracks), "warning"), (ends_short(tracks), "note")):
         if told:
             problems.append(Problem(told.code, str(told), "length_mm", severity=severity, file=SHEET))
