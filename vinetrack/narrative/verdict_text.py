@@ -248,8 +248,9 @@ def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
 def _shared_remedies(numbers: Sequence[Number]) -> list[str]:
     """What would make the shared part of the errors smaller, where that is most of an error."""
     most = [p for p in numbers if p.shared and p.shared_sigma**2 > 0.5 * p.sigma**2]
+    whole = ", and may be all of the size" * any(p.low < 0 < p.high for p in most)  # its 95 % interval holds 0
     sources = dict.fromkeys(max(p.shared, key=lambda source: p.shared[source]) for p in most)
-    return [f"what all trials share is most of the error: {SHARED_REMEDIES[source]}" for source in sources]
+    return [f"what all trials share is most of the error{whole}: {SHARED_REMEDIES[source]}" for source in sources]
 
 
 def _instead(diagnosis: Diagnosis) -> tuple[str, str]:
