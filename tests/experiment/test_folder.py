@@ -42,8 +42,9 @@ def test_blanks_that_matter_are_noted_with_what_they_stand_for_or_keep_from_bein
     assert "reservoir_depletion" in said["chamber_l"]
     stated = one(folder, payload_g=None, growth_angle_deg="0", film_density_kg_m3="920", chamber_l="2", inlet_mm="6")
     assert [note.split()[0] for note in stated.blank_notes] == ["payload_g"]
-    (problem,) = read_experiment(write(folder, GOOD.replace(",3,0\n", ",3,\n"))).problems
-    assert (problem.code, problem.trial, problem.column) == ("blank", "b", "payload_g")
+    for other, warned in (("35.6", []), ("0", [("blank", "b", "payload_g")])):
+        read = read_experiment(write(folder, GOOD.replace(",3,0\n", ",3,\n").replace("35.6", other)))
+        assert [(one.code, one.trial, one.column) for one in read.problems] == warned
 
 
 def test_pressures_that_are_all_below_the_yield_pressure_stop_and_some_warn(folder):

@@ -381,7 +381,9 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     vines = [row for row in in_use if row.travel_ratio == 2]
     may_be_blank = [name for name, column in COLUMNS.items() if column.if_blank or column.default == "unknown"]
     blank = {column: tuple(row.name for row in vines if column not in row.given) for column in may_be_blank}
-    partly = [name for name, names in blank.items() if COLUMNS[name].if_blank and len(names) < len(vines)]
+    # Where no row writes 0, a blank payload is none, as many write it.
+    unsaid = [name for name in blank if COLUMNS[name].default != "0" or any(row.number(name) == 0 for row in vines)]
+    partly = [name for name in unsaid if COLUMNS[name].if_blank and len(blank[name]) < len(vines)]
     for row in vines if settings else ():
         row.add_blank(partly, "others have a value, so fill it in, 0 as well", "warning")
     for row in in_use:
