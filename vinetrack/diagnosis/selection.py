@@ -140,9 +140,11 @@ class Search:
 
     def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
         """A likelier fit of the model itself, from the best hypothesis where that gains without a size beyond two
-        errors: the fit had ended in a local maximum, and that in a higher one. None where ln L rises by less than 1.
+        errors: the fit had ended in a local maximum, and that in a higher one. None where ln L rises by less than 1. An
+        effect that contains another as a limit is not absent there.
         """
         gaining = [one for one in hypotheses if one.delta_chi2 > ANSWER_SET_DELTA_CHI2 and not one.split]
+        gaining = [one for one in gaining if not one.effects[0].replaces]
         if not gaining or size_in_errors((best := best_of(gaining)).effects[0], best.fit) >= 2:
             return None
         fit = full_fit(best.fit, self.before.model, between=self.before.predictor.layout.between)
