@@ -530,6 +530,8 @@ class EdgeTracker(Tracker):
         exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
         for iteration in range(3):
             before, (path, cost) = path, _path_by_appearance(strip, state.appearance, passed)
+            # Backwards in time the end is a start too: a path that leaps there goes over to what comes before the tip.
+            path = np.minimum(path, -column_after_leap(-path[::-1]) or np.inf)
             # 1.0: two paths are the same if they nowhere differ by more than this (derived)
             if iteration > 0 and np.abs(before - path).max() <= 1.0:
                 break
