@@ -4,10 +4,8 @@ story of the README and the notebook of the documentation run on it."""
 import json
 import re
 from pathlib import Path
-from shutil import copytree
 
 import notebook
-import pandas as pd
 import pytest
 from explorer_campaign import FEW_CANDIDATES, ROUGH_FIGURES, SETTINGS, SMALL, make_experiment, make_results, run
 from matplotlib.figure import Figure
@@ -58,15 +56,6 @@ def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded,
         loaded.plot("trial_motion", trial="nobody")
     with pytest.raises(ResultsError):
         vt.load(tmp_path)
-
-
-def test_tables_without_a_column_of_today_are_said_to_be_old(small_run, tmp_path):
-    old = tmp_path / "old"
-    copytree(small_run, old)
-    for path in (old / "tracks").iterdir():
-        pd.read_csv(path).drop(columns="pressure_Pa").to_csv(path, index=False)
-    with pytest.raises(ResultsError):
-        vt.power(vt.load(old))
 
 
 @pytest.mark.slow

@@ -393,6 +393,16 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey):
     assert np.abs(error[usable]).max() < 0.1
 
 
+def test_a_bright_door_that_comes_over_the_tip_at_rest_is_not_its_film():
+    true = np.minimum(grown_px(np.arange(95.0)), 300.0)
+    luma = step_frames(true[:, None])
+    for i in range(80, 95):  # the tip rests from the 72nd frame on
+        luma[i, : 20 * (i - 79), 293:317] = 220
+    error, tracking, *_ = step_errors(luma, 0.05, true)
+    sure = tracking.track.usable & (tracking.track.flag == "")
+    assert (sure[14:79].all(), np.abs(error[sure]).max() < 1.5) == (True, True)  # as film it puts the edge 6 px back
+
+
 @pytest.mark.parametrize(("width_px", "grey", "count"), [(26, 20.0, 105.0), (44, 230.0, 105.0), (64, 110.0, 83.0)])
 def test_an_edge_behind_a_post_is_lost_and_all_others_are_found(width_px, grey, count):
     """The last film ends with 26 px of growth beyond the post."""
