@@ -142,13 +142,15 @@ def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(mon
 
 @pytest.mark.parametrize(("size", "end", "higher"), [(0.1, -900.0, True), (0.1, -999.5, False), (2.1, -900.0, False)])
 def test_where_effects_of_no_size_gain_the_model_itself_is_fitted_again_from_there(monkeypatch, size, end, higher):
-    numbers = [SimpleNamespace(key=key, value=size, sigma=1.0) for key in ("air_drag.C_D", "supply_refill.tau")]
+    sizes = {"air_drag.C_D": size, "supply_refill.tau": size, "reservoir_depletion.gamma": 700.0}
+    numbers = [SimpleNamespace(key=key, value=value, sigma=1.0) for key, value in sizes.items()]
     search, fit = sets_of([]), SimpleNamespace(log_likelihood=end)
     search.before = of((), -1000.0).fit
     search.before.predictor.layout = SimpleNamespace(between=())
     monkeypatch.setattr(selection, "full_fit", lambda *_, **_how: fit)
-    gaining = [replace(of([key], -890.0, numbers=numbers), delta_chi2=220.0) for key in ("air_drag", "supply_refill")]
-    assert [search.higher_base([one]) for one in gaining] == [fit if higher else None, None]
+    drag, *chamber = (replace(of([key.split(".")[0]], -890.0, numbers=numbers), delta_chi2=220.0) for key in sizes)
+    # A supply that never refills the chamber, by chance no less likely than none, is there all the same.
+    assert [search.higher_base(those) is fit for those in ([drag], chamber)] == [higher, False]
 
 
 def test_the_limit_of_an_effect_is_fitted_from_where_that_ended(monkeypatch):

@@ -189,14 +189,13 @@ def test_a_falling_ball_is_measured_but_has_no_place_in_the_law():
     """½gt² at 500 frames a second: no plateau; the last speed is g t."""
     time_s = np.arange(150) / 500
     fallen = 0.5 * G * np.maximum(time_s - 0.05, 0) ** 2
-    noise = 1e-4 * np.random.default_rng(4).standard_normal(150)
+    position_m = 0.3 + fallen + 1e-4 * np.random.default_rng(4).standard_normal(150)
     ball = Trial(name="ball", travel_ratio=1.0, payload_kg=0.05, pressure_Pa=0.0, yield_pressure_Pa=0.0)
-    result = summary.summarise_trial(ball, plain_track(time_s, 0.3 + fallen + noise), RunSettings(), base_model())
+    result = summary.summarise_trial(ball, plain_track(time_s, position_m), RunSettings(), base_model())
     assert result.point["used"] is False
     assert result.row["final_lead_velocity_m_s"] == pytest.approx(G * (time_s[-1] - 0.05), rel=0.05)
     assert math.isnan(float(result.row["efficiency"]))  # type: ignore[arg-type]
-    seen = plain_track(time_s[30:], (0.3 + fallen + noise)[30:])
-    late = summary.summarise_trial(ball, seen, RunSettings(), base_model())
+    late = summary.summarise_trial(ball, plain_track(time_s[30:], position_m[30:]), RunSettings(), base_model())
     assert (late.release.moving_from_start, late.row["status"]) == (True, "ok")  # seen late, as from a launcher's mouth
 
 

@@ -93,13 +93,12 @@ def test_check_names_a_copied_track_and_one_that_is_longer_than_its_vine(tmp_pat
         noise_m = 1e-4 * np.random.default_rng(seed).standard_normal(200)
         position_m = np.maximum(time_s - 0.05, 0) * 2 + noise_m
         pd.DataFrame({"time_s": time_s, "position_m": position_m}).to_csv(tmp_path / f"{name}.csv", index=False)
-    length_mm, window = {"d": 250}, {"a": "50:90"}
-    rows = [f"{n},{n}.csv,24,200,{length_mm.get(n, 400)},20,3,{window.get(n, '')}\n" for n in "abcd"]
+    rows = [f"{name},{name}.csv,24,200,{250 if name == 'd' else 400},20,3,50:90\n" for name in "abcd"]
     header = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,steady\n"
     (tmp_path / "trials.csv").write_text(header + "".join(rows), encoding="utf-8")
     problems = workflow.check_folder(tmp_path).problems
     assert [(one.trial, one.severity) for one in problems if one.code == "not_measured"] == [("c", "warning")]
-    assert [(one.column, one.line) for one in problems if one.code == "window"] == [("steady", 2)]  # typed in ms
+    assert [one.trial for one in problems if one.code == "window"] == [*"abcd"]  # typed in milliseconds
     assert [one.column for one in problems if one.code == "longer_than_stated"] == ["length_mm"]
     facts = longer_than_stated(pairs_of(tmp_path)[0]).facts
     assert (facts["count"], facts["name"], facts["length_m"]) == (1, "d", 0.25)

@@ -140,12 +140,10 @@ class Search:
 
     def higher_base(self, hypotheses: Sequence[LikelihoodRatio]) -> Fit | None:
         """A likelier fit of the model itself, from the best hypothesis where that gains without a size beyond two
-        errors: the fit had ended in a local maximum, and that in a higher one. None where ln L rises by less than 1. An
-        effect that contains another as a limit is not absent there.
+        errors: the fit had ended in a local maximum, and that in a higher one. None where ln L rises by less than 1.
         """
         gaining = [one for one in hypotheses if one.delta_chi2 > ANSWER_SET_DELTA_CHI2 and not one.split]
-        gaining = [one for one in gaining if not one.effects[0].replaces]
-        if not gaining or size_in_errors((best := best_of(gaining)).effects[0], best.fit) >= 2:
+        if not gaining or size_in_errors((best := answer_set(gaining)[0][0]).effects[0], best.fit) >= 2:
             return None
         fit = full_fit(best.fit, self.before.model, between=self.before.predictor.layout.between)
         return fit if fit and fit.log_likelihood > self.before.log_likelihood + 1 else None
@@ -557,7 +555,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     # of the tracks, and trials scatter no more than careful work allows.
     for every in (False, True):
         hypotheses = [*search.extend(every=every), *alone]
-        best = best_of(hypotheses) if hypotheses else None
+        best = answer_set(hypotheses)[0][0] if hypotheses else None
         if not every and nothing_rejects and (best is None or best.sigma < SEARCH_SIGMAS):
             return nothing_found()
         if best is None or (not every and not best.plausible):

@@ -473,15 +473,13 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         Problem("not_measured", f"is left out of the fit: {why}", severity="warning", file=SHEET, trial=name)
         for name, why in not_measured(tracks).items()
     ]
-    lasts_s = {trial: facts.duration_s for trial, facts in surveyor.facts.items()}
-    lasts_s |= {trial: float(track.time_s[-1]) for trial, track in tracks}
-    for trial, end_s in lasts_s.items():
-        if trial.steady_window_s is not None and trial.steady_window_s[1] > 1.5 * end_s:  # 1.5: rounded up (chosen)
-            beyond, remedy = f"ends beyond the recording, which lasts {end_s:.3g} s", "write the window in seconds"
-            problem = Problem(
-                "window", beyond, "steady", severity="warning", file=SHEET, trial=trial.name, remedy=remedy
-            )
-            problems.append(replace(problem, line=experiment.lines.get(trial.name, 0)))
+    ends_s = {trial: facts.duration_s for trial, facts in surveyor.facts.items()}
+    ends_s |= {trial: float(track.time_s[-1]) for trial, track in tracks}
+    problems += [
+        Problem("window", f"begins after the recording has ended, at {end_s:.3g} s: is it in seconds?", "steady",
+                severity="warning", file=SHEET, trial=trial.name)
+        for trial, end_s in ends_s.items() if trial.steady_window_s is not None and trial.steady_window_s[0] > end_s
+    ]  # fmt: skip
     for told, severity in ((longer_than_stated(tracks), "warning"), (ends_short(tracks), "note")):
         if told:
             problems.append(Problem(told.code, str(told), "length_mm", severity=severity, file=SHEET))
