@@ -70,7 +70,8 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             speed_scale = max(speed_scale, v)
             h = 1e-2 * max(v, 1e-3 * speed_scale) / max(abs(acceleration), 1e-9)
         if phase == at_rest:
-            if _ask(equations, Asked.REST_ACCELERATION, point.time, point.x, 0.0, point.chamber, trial)[0] <= 0:
+            drive, _rate = _ask(equations, Asked.REST_ACCELERATION, point.time, point.x, 0.0, point.chamber, trial)
+            if drive <= 0 or point.time > 0:  # What is left of the drive of one that has just stopped is rounding.
                 start, chamber = _wait_for_drive(equations, trial, point, last_time)
                 resting = Point(point.time, point.x, 0.0, 0.0, chamber)
                 row = _write_at_rest(equations, trial, times, row, start, resting, out)
