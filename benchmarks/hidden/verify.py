@@ -101,7 +101,7 @@ def ours(effect: str, trial: Trial, times: Floats, B: float, n: float) -> Floats
     bends = np.array([(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]).reshape(-1, 3)
     clock = 1 + eps if effect == "time_base" else 1.0
     out, _ = follow(times / clock, tube, Physics(B=B, n=n, **physics), bends)
-    y = out[:, 0]
+    y = out[:, 0] - out[0, 0]  # since rest
     if effect == "perspective":
         y = y + values["k"] * y**2
     return np.where(out[:, 1] < 0.95 * trial.length_m, y * (1 + eps if effect == "length_scale" else 1.0), np.nan)

@@ -158,6 +158,9 @@ def integrate_trials(equations, batch, first, last, rtol, out, ends, work, means
         status, end_time, end_speed, n_steps, slack_time = _integrate(
             equations, trial, times, batch.breakpoints[i], batch.stops[i], rtol, out[rows], work
         )
+        at_rest = equations.observed(0.0, 0.0, 0.0, equations.first_chamber(trial), trial)
+        for row in range(batch.starts[i], batch.starts[i + 1]):
+            out[row, 3] -= at_rest
         end = Point(end_time if status == Status.ENDED else np.inf, batch.stops[i], end_speed, 0.0, 0.0)
         row_delay = equations.row_delay(trial)
         if row_delay != 0:

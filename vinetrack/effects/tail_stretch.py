@@ -7,7 +7,7 @@ at release and decreases as the speed grows and the tension falls; the part of t
     ε = T₁/(EπDt) of the tail, ε_w = (PA − T₁)/(EπDt) of the wall, ε₀ that of the tail before release
 
 T₁ is the tension of the tail that balances the forces at the tip; the wall carries the pressure force on the tip minus
-that tension. ε₀ is constant in a trial and part of its origin: it is left out here. The parameter is the compliance
+that tension. ε₀ is not below, since every reported position is taken from that at rest. The parameter is the compliance
 1/E: the stretch is proportional to it and vanishes at 0, where a score test can start, and its error is symmetric; in E
 no stretch would lie at infinity, where the gradient vanishes. 10 to 50 MPa are 100 to 20 billionths per pascal.
 
