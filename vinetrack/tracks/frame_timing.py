@@ -153,7 +153,7 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     seems_copy = is_odd & (np.abs(speed) < 0.1 * larger) & ~(is_long[:-2] | is_long[2:]) & (rows[1:] > after)
     seem = np.where(seems_copy & (frames == 1), 0.0, frames)
     for i in suspects.tolist():
-        seem[i] = frames[i]
+        seem[i : i + 2] = frames[i : i + 2]  # A long step before what seems a copy is that of one outlier.
         kept = np.append(True, seem > 0)
         others_corrected = np.append(0.0, np.cumsum(seem))[kept], y[kept]
         if (fault := _fault_at(*others_corrected, int(np.count_nonzero(kept[:i])), noise_m[i], rho)) is not None:
