@@ -435,31 +435,29 @@ def read_by_rows(times, out, ratio, end, delay):
 
 
 @compiled
-def average_over(times, out, means, ratio, end, square):
-    """Replace instantaneous positions by their means over the time around each."""
-    half = 0.5 * math.sqrt(square)
+def average_over(times, out, work, ratio, end, square):
+    """Replace instantaneous positions by their means over the time around each. Shape: work (2, n_times or more)."""
+    half, since_first, means = 0.5 * math.sqrt(square), work[0], work[1]
+    since_first[0] = 0.0
+    for k in range(times.size - 1):
+        since_first[k + 1] = since_first[k] + _integral_from(times, out, ratio, end, k, times[k + 1])
     for i in range(times.size):
-        first, last = times[i] - half, times[i] + half
-        k = i
-        while k > 0 and times[k] > first:
-            k -= 1
-        area, at = 0.0, first
-        while at < last:
-            # The intervals before the first time and after the last are one piece each.
-            until = last
-            if at < times[0]:
-                until = min(last, times[0])
-            elif k < times.size - 1:
-                until = min(last, times[k + 1])
-            if at < end.time < until:
-                until = end.time
-            area += _integral(times, out, ratio, end, k, at, until)
-            at = until
-            while k < times.size - 1 and times[k + 1] <= at:
-                k += 1
-        means[i] = area / (2 * half)
+        means[i] = 0.0
+        for side in (-1, 1):
+            at = times[i] + side * half
+            k = max(np.searchsorted(times, at, side="right") - 1, 0)
+            means[i] += side * (since_first[k] + _integral_from(times, out, ratio, end, k, at)) / (2 * half)
     for i in range(times.size):
         out[i, 3] = means[i]
+
+
+@compiled
+def _integral_from(times, out, ratio, end, k, until):
+    """Integral of the reported position, m s, from time k until another before the next, past the end of growth."""
+    if times[k] < end.time < until:
+        before = _integral(times, out, ratio, end, k, times[k], end.time)
+        return before + _integral(times, out, ratio, end, k, end.time, until)
+    return _integral(times, out, ratio, end, k, times[k], until)
 
 
 @compiled

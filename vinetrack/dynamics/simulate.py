@@ -253,7 +253,7 @@ class Batch:
         longest = int(np.diff(self.starts).max(initial=0))
 
         def integrate(first: int, last: int) -> None:
-            work, means = np.empty((5, 4)), np.empty(longest)
+            work, means = np.empty((5, 4)), np.empty((2, longest))
             self.integrate_many(self.arrays, first, last, relative_tolerance, out, ends, work, means)
 
         if threads < 2:
