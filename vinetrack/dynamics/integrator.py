@@ -329,7 +329,8 @@ def _wait_for_drive(equations, trial, point, until):
 @compiled
 def _resolvable_start(equations, trial, time, until, x, chamber, delay):
     """Time at which a drive that rises from zero at `time` has moved the vine by 10⁻⁹ of the travel, and the pressure
-    of the chamber then: before, the drive is a difference of large forces below their rounding error.
+    of the chamber then: before, the drive is a difference of large forces below their rounding error. The time is later
+    than `until` if it never does.
     """
     start, pressure = time, chamber
     while time + delay < until:
@@ -343,6 +344,8 @@ def _resolvable_start(equations, trial, time, until, x, chamber, delay):
             break
         start, pressure = time + delay, after
         delay *= 2
+    else:
+        return until + 1.0, pressure
     return start, pressure
 
 
