@@ -570,12 +570,12 @@ class Outline:
     """Outline of the tube that the front leaves, px: its width, and its middles across the strip at places along it."""
 
     half_px: float
-    width_px: float
-    width_sigma_px: float
     state: EdgeState
     passed: tuple[int, int, int]
     places_px: Floats
     middles_px: Floats
+    width_px: float
+    width_sigma_px: float
 
 
 def outline(strip: Strip, parts: int) -> Outline:
@@ -584,24 +584,36 @@ def outline(strip: Strip, parts: int) -> Outline:
     """
     state, passed = initial_front_path(strip)
     film, background = state.appearance[:2, :, passed[0] : passed[1]]
-    power = (film - background).astype(float) ** 2
-    sides, places, contrasts = [], [], []
+    side, place, contrast = _sides(film - background, parts)
+    width = side[:, 1] - side[:, 0]
+    median_width = float(np.median(width))
+    typical = np.abs(width - median_width) <= 0.15 * median_width + 2
+    typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
+    outline_of_front = median_width / 2 + 1.5, state, passed, passed[0] + place[typical], side[typical].mean(axis=1)
+    # Just behind a slow front there is but a rounded tip; what the front has left a width behind is a whole tube.
+    last, first = (median_of(strip.brightness(at)) for at in (slice(-END_FRAMES, None), slice(0, END_FRAMES)))
+    whole = (last - first)[:, passed[0] : max(passed[1] - round(median_width), passed[0])]
+    ends = _sides(whole, parts)[0] if whole.shape[1] >= 2 * RUN_PX else side
+    width = max((each[:, 1] - each[:, 0] for each in (side, ends)), key=np.median)
+    median_width = float(np.median(width))
+    width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
+    # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
+    faint = 0.15 * median_width if contrast < 25.0 else 0.0
+    # 1.0: error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
+    return Outline(*outline_of_front, median_width, float(np.linalg.norm([width_error, 1.0, faint])))
+
+
+def _sides(change: Floats, parts: int) -> tuple[Floats, Floats, float]:
+    """Both sides of a tube from the middle of a strip, px, and places, of stretches along it, by the change that the
+    tube makes; and its typical contrast. Shapes: change (n_rows, n_columns) → (n_stretches, 2), (n_stretches,).
+    """
+    power, sides, places, contrasts = change.astype(float) ** 2, [], [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
         profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
         contrasts.append(float(np.quantile(profile, 0.75)))
         sides.append(_max_sum_run(profile - max(0.4 * contrasts[-1], 0.25 * float(profile.max()))))
-        places.append(passed[0] + float(piece.mean()))
-    side, place = np.array(sides) - (len(power) - 1) / 2, np.array(places)
-    width = side[:, 1] - side[:, 0]
-    typical = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
-    typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
-    median_width = float(np.median(width))
-    width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
-    # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
-    faint = 0.15 * median_width if float(np.median(contrasts)) < 25.0 else 0.0
-    # 1.0: error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
-    sigma, middles = float(np.linalg.norm([width_error, 1.0, faint])), side[typical].mean(axis=1)
-    return Outline(median_width / 2 + 1.5, median_width, sigma, state, passed, place[typical], middles)
+        places.append(float(piece.mean()))
+    return np.array(sides) - (len(power) - 1) / 2, np.array(places), float(np.median(contrasts))
 
 
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
