@@ -116,11 +116,11 @@ def cut_strip(
     else:
         scale, offset, shift, stabilised = before.scale, before.offset, before.shift_px, before.stabilised
     along, across = np.meshgrid(np.arange(int(axis.length_px) + 1.0), np.arange(-half, half + 1.0))
-    places, moved = axis.points(along.ravel(), across.ravel()), shift if stabilised else None
+    places, moved = axis.points(along, across), shift if stabilised else None
     # An axis along rows or columns of the picture is cut without interpolation, moved by less than half a pixel.
     if moved is None and (nearest or (not axis.bends and max(abs(axis.direction)) > 1 - 1e-9)):
         places = np.rint(places).astype(int)
-    values = _pixels(luma, places, moved, nearest).reshape(len(luma), *along.shape)
+    values = _pixels(luma, places, moved, nearest)
     # Noise of a pixel from differences of neighbouring frames, grey levels. Medians over pixels, since motion affects
     # few of them; at least 1, since compression freezes a picture at rest, while moving pixels are never known better.
     step = max(1, len(values) // 40)
@@ -147,21 +147,19 @@ def _pixels(
     luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | None, nearest: bool = False
 ) -> NDArray[Any]:
     """Pixels (x, y) of every frame, each moved by its own shift, bicubic or `nearest`; beyond the picture its border is
-    repeated. Whole places without a shift are read as they are. Shapes: places (n_pixels, 2) → (n_frames, n_pixels).
+    repeated. Whole places without a shift are read as they are. Shapes: places (..., 2) → (n_frames, ...).
     """
     import cv2
 
     if shift_px is None and places.dtype.kind == "i":
-        x, y = np.clip(places, 0, np.array(luma.shape[:0:-1]) - 1).T
+        x, y = np.moveaxis(np.clip(places, 0, np.array(luma.shape[:0:-1]) - 1), -1, 0)
         return np.take(luma.reshape(len(luma), -1), y * luma.shape[2] + x, axis=1)
-    # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
-    rows = np.pad(places, ((0, -len(places) % 1000), (0, 0)), mode="edge").reshape(-1, 1000, 2).astype(np.float32)
-    x, y = np.ascontiguousarray(np.moveaxis(rows, 2, 0))
+    x, y = (np.ascontiguousarray(np.atleast_2d(of_place), np.float32) for of_place in np.moveaxis(places, -1, 0))
     out, how = np.empty((len(luma), *x.shape), luma.dtype), cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
     for frame, cut, (dx, dy) in zip(luma, out, shifts.astype(np.float32), strict=True):
         cv2.remap(frame, x + dx, y + dy, how, dst=cut, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(len(luma), -1)[:, : len(places)]
+    return out.reshape(len(luma), *places.shape[:-1])
 
 
 # ------------------------------------------------------------------------------
@@ -191,7 +189,7 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     # 0.04, 2.5: smaller shake is not removed, px (chosen), and one of so many standard errors is noise (derived)
     least_px = np.maximum(0.04, 2.5 * np.median(sigmas[2], axis=0))
     if (np.median(np.abs(shifts[2]), axis=0) > least_px).any() and shifts_agree(shifts[:2], sigmas[:2]):
-        fit, shift = _followed(luma, places, picks)
+        fit, shift = _followed(luma, places, picks, fit)
         shaken = True
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
@@ -199,8 +197,6 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
 
 def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
     """Whole pixels (x, y) of the background on both sides of a tube, shape (n, 2); none where there is hardly any."""
-    from scipy.spatial import KDTree
-
     # 14, 44: rows of background on either side, at least and at most (chosen)
     rows = half + BAND_GAP_PX + np.arange(int(np.clip(half, 14, 44)))
     along, across = np.meshgrid(np.arange(1.0, axis.length_px), np.concatenate([-rows, rows]), indexing="ij")
@@ -211,21 +207,19 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
         return places[:0]
     # 9000: pixels used (derived), an odd number apart: rows come in pairs, and none is left out
     places = places[:: max(1, len(places) // 9000) | 1]
-    on_axis, apart = KDTree(axis.points(np.arange(axis.length_px + 1.0))), half + BAND_GAP_PX - 1.0
-    return places[np.isinf(on_axis.query(places, distance_upper_bound=apart)[0])]
+    return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1.0]
 
 
-def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats]:
-    """Register every frame again and again, each time from where it was found: fit and shift."""
-    basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
-    # 4: number of registrations, each from the result of the one before (chosen)
-    for turn in range(4):
-        fit = register(luma, places, basis, shift if turn else None)[0][2]
-        step = np.clip(fit[:, 2:], -1.5, 1.5)  # largest shift of one round, px (chosen)
+def _followed(luma: NDArray[Any], places: Indices, picks: Indices, fit: Floats) -> tuple[Floats, Floats]:
+    """Register every frame again and again, each time from where it was found, first by `fit`: fit and shift."""
+    shift = np.clip(fit[:, 2:], -1.5, 1.5)  # largest shift of one round, px (chosen)
+    basis = _reference(luma[picks], places, shift[picks])  # sharper than that of the shaken pictures
+    # 3: most registrations, each from the result of the one before (chosen)
+    for _ in range(3):
+        fit = register(luma, places, basis, shift)[0][2]
+        step = np.clip(fit[:, 2:], -1.5, 1.5)
         shift = shift + step
-        if turn == 0:
-            basis = _reference(luma[picks], places, shift[picks])  # sharper than that of the shaken pictures
-        elif np.abs(step).max() < 0.02:  # px (chosen)
+        if np.abs(step).max() < 0.02:  # px (chosen)
             break
     return fit, shift
 
