@@ -33,6 +33,7 @@ from vinetrack.diagnosis.misfit_tests import (
     CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
+    level_of,
     misfit_tests,
     plausible_range,
     products_of,
@@ -147,10 +148,8 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     only: str = "",
 ) -> Power:
-    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect: in the first round
-    of a diagnosis of its model, also where that is one with effects that a diagnosis added.
-    """
-    tests = replace(tests, level=FALSE_ALARM_LEVEL_FIRST_ROUND)
+    """Compute which effects, or `only` one of them, at which sizes, a diagnosis of these trials and model can detect."""
+    tests = replace(tests, level=level_of(tests.fit.model))
     # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
     start = noiseless_start(tests.fit) if tests.fit.solution.noise_held else None
     # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
@@ -357,7 +356,7 @@ def fitted_tests(fitted: Fit, candidates: Sequence[str] | None = None) -> tuple[
     """Misfit tests of a fit with all candidates, and the reasons by name of those that cannot act with this sheet."""
     tried = candidates_of(fitted.model, candidates, fitted.model.user_effects)
     effects, not_testable = testable(tried, fitted.predictor.data)
-    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), not_testable
+    return misfit_tests(fitted, effects, level_of(fitted.model)), not_testable
 
 
 def planned_tests(

@@ -29,7 +29,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import within_groups
 from vinetrack.dynamics.model import Model, check_needs, probe, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
-from vinetrack.effects import Effect, EffectError, Parameter
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter
 from vinetrack.inference.errors import cluster_variance, coarsest_groups
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names, groups_of
@@ -575,6 +575,15 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 
 # Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
+
+
+def level_of(model: Model) -> float:
+    """The level of a diagnosis of a model: that of later rounds where something was added to the base model, so that no
+    diagnosis contradicts the one which found it adequate.
+    """
+    is_base = set(model.names) <= set(BASE_EFFECTS)
+    return FALSE_ALARM_LEVEL_FIRST_ROUND if is_base else FALSE_ALARM_LEVEL_LATER_ROUNDS
+
 
 PROBE_LEVEL = 3e-4  # Largest level of the test of all probes (chosen)
 

@@ -31,7 +31,7 @@ from vinetrack.diagnosis.hypotheses import (
     likelihood_ratio,
 )
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, ladder, left_out_error, with_host
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SEARCH_SIGMAS, misfit_tests
+from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS, level_of, misfit_tests
 from vinetrack.diagnosis.missing_force import (
     LEAST_MISFIT_REDUCTION,
     QUANTITIES,
@@ -81,7 +81,7 @@ def add(
 
 def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
     """Fit a model with an effect added, as a diagnosis does; from the effect's own values where that gains nothing."""
-    tests = misfit_tests(before, (effect,), FALSE_ALARM_LEVEL_FIRST_ROUND)
+    tests = misfit_tests(before, (effect,), level_of(before.model))
     fits = [ratio.fit for ratio in Search(tests, report).extend(every=True)]
     if not fits or fits[0].log_likelihood < before.log_likelihood:
         fits.append(refit(before, before.model + effect))

@@ -37,13 +37,13 @@ from vinetrack.diagnosis.hypotheses import (
     stand_in,
 )
 from vinetrack.diagnosis.misfit_tests import (
-    FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
     CandidateShape,
     MisfitTests,
     exceeds_slow_errors,
     has_excess_scatter,
+    level_of,
     misfit_tests,
     plausible_range,
     slip_of,
@@ -522,9 +522,9 @@ class SelectionStep:
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[SelectionStep]:
     """Select the effects that a model lacks."""
     report("testing the model")
-    tests = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    tests = misfit_tests(fit, effects, level_of(fit.model))
     trial_differences = differences(fit)
-    differing = significant(trial_differences, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    differing = significant(trial_differences, tests.level)
     nothing_rejects = not tests.rejects_model and not any(difference.stated for difference in differing)
     passed = ADEQUATE if fit.converged else UNEXPLAINED
     if nothing_rejects and not tests.needs_search:
