@@ -148,7 +148,7 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     only: str = "",
 ) -> Power:
-    """Compute which effects, or `only` one of them, at which sizes, a diagnosis of these trials and model can detect."""
+    """Compute which effects, or `only` one, at which sizes, a diagnosis of these trials and model can detect."""
     tests = replace(tests, level=level_of(tests.fit.model))
     # Planned trials, whose noise is stated; a diagnosis, of measured ones, can afford linear theory.
     start = noiseless_start(tests.fit) if tests.fit.solution.noise_held else None
