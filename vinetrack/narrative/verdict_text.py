@@ -216,6 +216,7 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
     """Sizes of what is in the model beyond its base, and where nothing was added of the members of the answer set."""
     beyond = [p for p in _settled(diagnosis)[0] if p.key.split(".")[0] not in BASE_EFFECTS]
     wider = [f"95 %: {bounds_text(p, with_unit=True)}{_confounded_interval(diagnosis, p)}" for p in beyond]
+    wider = [f"{p.title} {of_one}" for p, of_one in zip(beyond, wider, strict=True)] if len(beyond) > 1 else wider
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers and not diagnosis.effects]
     sizes = [f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]]
     answer = "; ".join(filter(None, (", ".join(map(split_estimate, beyond)), *sizes)))
@@ -250,7 +251,8 @@ def _shared_remedies(numbers: Sequence[Number]) -> list[str]:
     most = [p for p in numbers if p.shared and p.shared_sigma**2 > 0.5 * p.sigma**2]
     whole = ", and may be all of the size" * any(p.low < 0 < p.high for p in most)  # its 95 % interval holds 0
     sources = dict.fromkeys(max(p.shared, key=lambda source: p.shared[source]) for p in most)
-    return [f"what all trials share is most of the error{whole}: {SHARED_REMEDIES[source]}" for source in sources]
+    remedies = ", and ".join(SHARED_REMEDIES[source] for source in sources)
+    return [f"what all trials share is most of the error{whole}: {remedies}"] if most else []
 
 
 def _instead(diagnosis: Diagnosis) -> tuple[str, str]:
