@@ -26,7 +26,7 @@ PARAMETERS = (
         3e-6,
         bounds=(-1e-4, 1e-4),
         plausible=(-1e-5, 1e-5),
-        meaning="relative change of B per pascal",
+        meaning="relative change of B with pressure",
     ),
 )
 

@@ -26,7 +26,7 @@ PARAMETERS = (
         2e-6,
         bounds=(0.0, 1e-4),
         plausible=(3e-7, 1e-5),
-        meaning="relative widening of D per pascal",
+        meaning="relative widening of D with pressure",
     ),
 )
 
