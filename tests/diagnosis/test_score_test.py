@@ -72,6 +72,7 @@ def test_candidates_are_false_alarms_as_seldom_as_they_say(seed, trials, scatter
     draw = np.random.default_rng(seed)
     asked = [questioned(scores(draw, trials, len(named), scatter), level, named) for _ in range(campaigns)]
     assert sum(each.any_exceeds(level) for each in asked) <= most
+    assert [*map(misfit_tests.level_of, (vt.base_model(), vt.base_model() + "leak"))] == [FIRST, LATER]
 
 
 def test_a_size_at_its_bound_takes_nothing_from_an_effect():
@@ -113,14 +114,10 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     shaped = scores(np.random.default_rng(20607), 12, 2, sizes=9.0)
     for name in ("_probe_shapes", "products_of"):
         monkeypatch.setattr(misfit_tests, name, lambda *_: answers)
-    monkeypatch.setattr(misfit_tests, "between_conditions_p", lambda _: 1.0)
-    monkeypatch.setattr(misfit_tests, "scores_of", lambda *_: of)
-    assert not questioned(of).omnibus_rejects
-    monkeypatch.setattr(misfit_tests, "scores_of", lambda *_: shaped)
-    assert questioned(of).omnibus_rejects
-    monkeypatch.setattr(misfit_tests, "scores_of", lambda *_: of)
-    monkeypatch.setattr(misfit_tests, "between_conditions_p", lambda _: 1e-5)
-    assert questioned(of).omnibus_rejects
+    for left, p, rejects in ((of, 1.0, False), (shaped, 1.0, True), (of, 1e-5, True)):
+        monkeypatch.setattr(misfit_tests, "scores_of", lambda *_, left=left: left)
+        monkeypatch.setattr(misfit_tests, "between_conditions_p", lambda _, p=p: p)
+        assert questioned(of).omnibus_rejects == rejects
     assert not questioned(of, level=0.1 * LATER).omnibus_rejects
 
 
