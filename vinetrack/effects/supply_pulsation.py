@@ -32,7 +32,7 @@ PARAMETERS = (
         bounds=(1.0, 500.0),
         zero=20.0,
         plausible=(5.0, 100.0),
-        tried=tuple(float(f) for f in np.linspace(5.0, 95.0, 31)),
+        tried=tuple(float(f) for f in np.linspace(5.0, 95.0, 21)),
         meaning="frequency",
     ),
     Parameter(
