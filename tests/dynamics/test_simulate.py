@@ -182,7 +182,7 @@ def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays_and_a_slac
     assert vt.simulate(MODEL, taut, np.linspace(0, 0.2, 20)).lead_position_m[-1] > 1e-5
     # At an exponent near 0 what is left of a falling drive moves nothing: the vine stops once.
     creeping = MODEL.with_values({"eversion_damping.B": 2.15, "eversion_damping.n": 0.0077}) + "leak"
-    level = replace(VINE, diameter_m=0.012, length_m=0.36, pressure_Pa=21e3, yield_pressure_Pa=0, growth_angle_rad=1.571)
+    level = replace(VINE, diameter_m=0.012, length_m=0.36, pressure_Pa=21e3, yield_pressure_Pa=0, growth_angle_rad=1.57)
     assert vt.simulate(creeping, level, np.linspace(0, 3, 40)).status == "stalled"
     # No step meets a tolerance of nothing: the tail goes slack at release and gets no further.
     trial = LOADED.trial(pressure_Pa=7e3, tail_slack="free")
