@@ -117,7 +117,7 @@ def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path():
     strip = Strip(
         np.clip(values, 0, 255).astype(np.uint8), np.ones(80), np.zeros(80), np.zeros((80, 2)), 2.0, axis, False
     )
-    state, passed = initial_front_path(strip)
+    state, passed, _ = initial_front_path(strip)
     assert np.abs(state.edge - tip)[18:60].max() <= 6
     assert abs(passed[0] - 40) <= 8
     assert abs(passed[1] - 290) <= 3

@@ -452,9 +452,10 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats) -> Floats:
 LEAST_CHANGE, RUN_PX = 30.0, 9
 
 
-def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
+def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int], NDArray[np.float32]]:
     """Find the initial path of the front, with film and background for a straight tip and a typical blur; and the first
-    column of those that changed in runs, the one behind the last, and that in the last frame, which may be further on.
+    column of those that changed in runs, the one behind the last, and that in the last frame, which may be further on;
+    and the change of every pixel from the first pictures to the last.
     """
     ends = slice(-END_FRAMES, None), slice(0, END_FRAMES)
     last, first = (median_of(strip.brightness(frames)) for frames in ends)
@@ -476,7 +477,7 @@ def initial_front_path(strip: Strip) -> tuple[EdgeState, tuple[int, int, int]]:
     if first_column > last_column:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
     passed = int(first_column), int(last_column) + 1, int(max(last_column, by_now[-1])) + 1
-    return straight_tip(strip, _with_run_up(np.clip(path, *passed[:2]))), passed
+    return straight_tip(strip, _with_run_up(np.clip(path, *passed[:2]))), passed, last - first
 
 
 def _changed_columns(change: NDArray[np.float32], noise: float) -> Indices:
@@ -582,7 +583,7 @@ def outline(strip: Strip, parts: int) -> Outline:
     """Measure the centreline and width of the tube that the front leaves, by the contrast of each row between film and
     background in `parts` stretches along the axis: a given axis that is two degrees off cuts the tube obliquely.
     """
-    state, passed = initial_front_path(strip)
+    state, passed, change = initial_front_path(strip)
     film, background = state.appearance[:2, :, passed[0] : passed[1]]
     side, place, contrast = _sides(film - background, parts)
     width = side[:, 1] - side[:, 0]
@@ -591,8 +592,7 @@ def outline(strip: Strip, parts: int) -> Outline:
     typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
     outline_of_front = median_width / 2 + 1.5, state, passed, passed[0] + place[typical], side[typical].mean(axis=1)
     # Just behind a slow front there is but a rounded tip; what the front has left a width behind is a whole tube.
-    last, first = (median_of(strip.brightness(at)) for at in (slice(-END_FRAMES, None), slice(0, END_FRAMES)))
-    whole = (last - first)[:, passed[0] : max(passed[1] - round(median_width), passed[0])]
+    whole = change[:, passed[0] : max(passed[1] - round(median_width), passed[0])]
     ends = _sides(whole, parts)[0] if whole.shape[1] >= 2 * RUN_PX else side
     width = max((each[:, 1] - each[:, 0] for each in (side, ends)), key=np.median)
     median_width = float(np.median(width))
@@ -603,7 +603,7 @@ def outline(strip: Strip, parts: int) -> Outline:
     return Outline(*outline_of_front, median_width, float(np.linalg.norm([width_error, 1.0, faint])))
 
 
-def _sides(change: Floats, parts: int) -> tuple[Floats, Floats, float]:
+def _sides(change: NDArray[Any], parts: int) -> tuple[Floats, Floats, float]:
     """Both sides of a tube from the middle of a strip, px, and places, of stretches along it, by the change that the
     tube makes; and its typical contrast. Shapes: change (n_rows, n_columns) → (n_stretches, 2), (n_stretches,).
     """

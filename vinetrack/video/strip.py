@@ -147,7 +147,8 @@ def _pixels(
     luma: NDArray[Any], places: Indices | Floats, shift_px: Floats | None, nearest: bool = False
 ) -> NDArray[Any]:
     """Pixels (x, y) of every frame, each moved by its own shift, bicubic or `nearest`; beyond the picture its border is
-    repeated. Whole places without a shift are read as they are. Shapes: places (..., 2) → (n_frames, ...).
+    repeated. Whole places without a shift are read as they are. Shapes: places (..., 2) → (n_frames, ...); OpenCV takes
+    no side longer than 32766.
     """
     import cv2
 
